@@ -473,7 +473,7 @@ def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-de
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(sheets, scale, is_faint, fixed, chance, salt, numbers, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
@@ -482,9 +482,13 @@ def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift
         number.
     is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept; it then counts for
         those that are not. salt : uint64, a random number of the pass.
+    fixed : (t,) int64, number of the group of a triangle of a narrow lobe; 0 for others.
+    numbers : groups, every, lobe_groups: numbers of groups of faint triangles, of samples of which one looks for
+        them, and of groups of points of narrow lobes.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
-    offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
+    offsets : (1 + groups + lobe_groups, 2) float64, metres, of bright triangles, of the groups of faint ones, and of
+        those of narrow lobes.
     middle : (3,) float64, metres, the place from which coordinates count.
 
     Returns
@@ -494,12 +498,15 @@ def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift
         1 where the receiver is flat.
     """
     position, normal, triangles, shape, key, image = sheets
+    groups, every, lobe_groups = numbers
     name = _names_of(triangles, key, image)
     corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
     terms, n = np.empty((len(triangles), 3), np.float32), 0
     for t in range(len(triangles)):
-        group, weight = 0, 1.0
-        if is_faint[t]:
+        group, weight = fixed[t], 1.0
+        if group > 0:
+            weight = float(lobe_groups)
+        elif is_faint[t]:
             if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
                 continue
             group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]

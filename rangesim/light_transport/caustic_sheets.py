@@ -33,10 +33,10 @@ from rangesim.light_transport.caustic_kernels import (
     sides_of_photons,
     smooth_chains,
 )
-from rangesim.light_transport.delta_surfaces import meets_delta
+from rangesim.light_transport.delta_surfaces import meets_delta, sends_on
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
-from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
+from rangesim.light_transport.specular_tree import HASH_STEP, LOBE_POINTS, Landings, SpecularTree
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
 
@@ -68,6 +68,8 @@ lot. If it were smaller, many photons would carry little light."""
 PHOTONS = 1 << 13
 """Number of photons of a pass, as far as cells that are left can be divided into parts of their own. If there are more
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
+PHOTONS_WITH_LOBES = 1 << 11
+"""The same in scenes with narrow lobes, which send each photon into `LOBE_POINTS` directions."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
 MAX_SAG = 1e-3
@@ -161,6 +163,7 @@ class Sheets(NamedTuple):
     normal : (n, 3) float32, geometric normals.
     triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
     shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
+    lobe : (t,) uint32, number of the point of the narrow lobes that the light met, from 1 on; 0 if it met none.
     cut : ratio of the light that was lost in chains that are too long to all light.
     in_triangles : fraction of the flux that the grid's triangles carry; photons carry the rest.
     """
@@ -176,6 +179,7 @@ class Sheets(NamedTuple):
     flux: np.ndarray
     shape: np.ndarray
     key: np.ndarray
+    lobe: np.ndarray
     cut: float
     in_triangles: float
 
@@ -198,7 +202,7 @@ def trace_sheets(
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
     rng = np.random.default_rng(seed)
-    tracing = _Tracing(traced, pixel_rad, report)
+    tracing = _Tracing(traced, pixel_rad, seed, report)
     if not traced.projector.has_lens:
         return joined([tracing.sheets(power_w, rng, None)])
     made = [tracing.sheets(power_w * part, rng, p) for part, p in zip(LENS_WEIGHTS, _lens_points(), strict=True)]
@@ -266,13 +270,13 @@ class _Tracing:
 
     Parameters
     ----------
-    traced, pixel_rad, report : as for `trace_sheets`.
+    traced, pixel_rad, seed, report : as for `trace_sheets`.
     """
 
-    def __init__(self, traced: TracedScene, pixel_rad: float, report: Callable[[], None]) -> None:
+    def __init__(self, traced: TracedScene, pixel_rad: float, seed: int, report: Callable[[], None]) -> None:
         assert isinstance(traced.projector, Device)
         self.device, self.report = traced.projector, report
-        self.tree = SpecularTree(traced, Launches())
+        self.tree = SpecularTree(traced, Launches(), seed)
         width, height = (int(n[0]) for n in self.device.size)
         self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
         levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
@@ -285,7 +289,10 @@ class _Tracing:
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
         cells = CellGrid.of(self.device)
         meets, _ = meets_delta(
-            traced.scene, cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+            traced.scene,
+            cells.columns * cells.rows,
+            lambda a, b: self.device.centre_ray(cells.probes(a, b)),
+            sends_on,
         )
         self.delta = _Delta(
             maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
@@ -357,7 +364,8 @@ class _Tracing:
         """
         chance = np.minimum(cells[:, 3] / LEFT, 1)
         # Each cell is divided into parts x parts, each of which may have a photon
-        parts = int(np.clip(np.sqrt(PHOTONS / max(chance.sum(), 1)), 1, MAX_PARTS))
+        photons = PHOTONS_WITH_LOBES if self.tree.has_lobes else PHOTONS
+        parts = int(np.clip(np.sqrt(photons / max(chance.sum(), 1)), 1, MAX_PARTS))
         offset = np.indices((parts, parts)).reshape(2, -1).T / parts
         part = np.tile(offset, (len(cells), 1))
         cells, chance = np.repeat(cells, parts**2, axis=0), np.repeat(chance, parts**2)
@@ -397,8 +405,9 @@ class _Tracing:
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
         found, lost = [_no_landings()], [np.empty(0)]
-        for begin in range(0, len(pixels), MAX_AT_ONCE):
-            some = slice(begin, begin + MAX_AT_ONCE)
+        at_once = MAX_AT_ONCE // (LOBE_POINTS if self.tree.has_lobes else 1)
+        for begin in range(0, len(pixels), at_once):
+            some = slice(begin, begin + at_once)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
             rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
@@ -412,7 +421,7 @@ class _Tracing:
 def _no_landings() -> Landings:
     """No landing at all."""
     whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    return Landings(whole, whole, whole, real, real, real, vector, vector, vector)
+    return Landings(whole, whole, whole, whole, real, real, real, vector, vector, vector)
 
 
 def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
@@ -422,7 +431,7 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     of = triangles[:, 0]
     slowness = landings.ior[:, None] * landings.direction
     vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
-    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], cut, 0.0)
+    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], landings.lobe[of], cut, 0.0)
 
 
 def _parallelograms(

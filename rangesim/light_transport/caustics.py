@@ -16,7 +16,7 @@ import mitsuba as mi
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
-from rangesim.light_transport.delta_surfaces import has_delta
+from rangesim.light_transport.delta_surfaces import has_delta, has_throwers
 from rangesim.light_transport.sheet_scene import Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
@@ -44,7 +44,8 @@ def caustic_sheets(
     rigs : rigs of the pass, which share their emitter.
     report : called after each kernel launch.
     """
-    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    sends_on = has_delta(traced.scene) or has_throwers(traced.scene)
+    if not settings.caustics or not sends_on or isinstance(traced.projector, BeamDevice):
         return None
     pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
@@ -82,6 +83,7 @@ def caustic_light(
     channels: list[list[mi.Float]],
     vertex: Vertex,
     turn: mi.UInt32,
+    lobe_turn: mi.UInt32,
     pick: mi.Float,
     is_later: mi.Bool,
     place: mi.UInt32,
@@ -93,6 +95,8 @@ def caustic_light(
     Parameters
     ----------
     turn : UInt32, number that decides which faint triangles the sample looks for; it grows by 1 from sample to sample.
+    lobe_turn : UInt32, number that decides which points of narrow lobes the sample looks for; it grows by 1 from sample
+        to sample.
     pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
@@ -109,15 +113,16 @@ def caustic_light(
     weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
-        looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, is_turn, weight_of_bright]
+        looks,
+        exclude=[si, bsdf, vertex, shape, normal, seen, turn, lobe_turn, is_later, place, is_turn, weight_of_bright],
     ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        ray, step, above = sheets.ray(si.p, normal, turn, which, way)
+        ray, step, above = sheets.ray(si.p, normal, turn, lobe_turn, which, way)
         found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, ray.maxt - found.t - above, above, shape, normal, is_new)
-        irradiance *= dr.select(which == 0, weight_of_bright, 1)
+        irradiance *= dr.select(which != 1, weight_of_bright, 1)
         total += irradiance
         fraction = dr.select(is_here, irradiance / total, 0)
         taken = is_here & ((which == 0) | (pick < fraction))
@@ -141,5 +146,9 @@ def caustic_light(
         last = dr.select(hit, found.prim_index, last)
         way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
-        looks &= (which == 0) | ((which == 1) & is_turn)
+        if dr.hint(sheets.has_lobes, mode="scalar"):
+            which = dr.select((which == 1) & ~is_turn, 2, which)
+            looks &= which <= 2
+        else:
+            looks &= (which == 0) | ((which == 1) & is_turn)
     return channels, radiance

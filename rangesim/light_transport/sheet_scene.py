@@ -7,6 +7,7 @@ surface by a distance of its own.
 
 Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side. A
 sample of a pixel looks into one group, whose light counts for all. The samples of a pixel look into all groups in turn.
+Light of narrow lobes is dealt out in the same way, by the points of the lobes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from rangesim.light_transport.caustic_kernels import crowd_of, irradiance_of, lifted
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
+from rangesim.light_transport.specular_tree import LOBE_POINTS
 
 LIFT = 4e-4
 """Largest distance between two triangles in one place, as a fraction of their distance from the projector: a thousand
@@ -44,6 +46,9 @@ a longer period, faint light would be noisy in passes of few samples."""
 EVERY = 4
 """Largest number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
 longer."""
+LOBE_GROUPS = 16
+"""Number of groups of the points of narrow lobes. A sample of a pixel looks into one group, so 16 samples look into all
+of them once."""
 CROWD = 2.0
 """Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
 fewer of them at little cost."""
@@ -129,21 +134,27 @@ class SheetScene:
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
-        across = math.isqrt(groups) + 1  # all of them lie in a square
+        self.has_lobes = bool(sheets.lobe.any())
+        places_needed = 1 + groups + self.has_lobes * LOBE_GROUPS
+        across = math.isqrt(places_needed - 1) + 1  # all of them lie in a square
         places = [[g % across, g // across] for g in range(across**2)]
         places = sorted(places, key=lambda place: np.hypot(*(np.array(place) - across // 2)))
-        offsets = (np.array(places[: groups + 1]) - across // 2) * (SPACING * size)  # bright ones in the middle
+        offsets = (np.array(places[:places_needed]) - across // 2) * (SPACING * size)  # bright ones in the middle
         image = np.column_stack([sheets.u, sheets.v]).view(np.uint64)[:, 0]
         columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key, image)
         flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
-        is_faint = level < FAINT
+        is_faint = (level < FAINT) & (sheets.lobe == 0)
         weak = np.flatnonzero(is_faint)
         crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
         is_faint[weak[crowd < CROWD]] = False
+        # Points of a lobe in a row are spread over it, so each group stands for all of it
+        of_lobe = (sheets.lobe.astype(np.int64) - 1) * LOBE_GROUPS // LOBE_POINTS
+        fixed = np.where(sheets.lobe > 0, 1 + groups + of_lobe, 0)
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
+        numbers = groups, every, LOBE_GROUPS
         corners, names, terms = lifted(
-            columns, scale, is_faint, chance, salt, groups, every, LIFT * distance, flat_lift, offsets, middle
+            columns, scale, is_faint, fixed, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
@@ -184,6 +195,7 @@ class SheetScene:
         point: mi.Point3f,
         normal: mi.Normal3f,
         turn: mi.UInt32,
+        lobe_turn: mi.UInt32,
         which: mi.UInt32,
         way: mi.Float,
     ) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
@@ -191,11 +203,14 @@ class SheetScene:
         metres from a triangle that it meets to where the next one is looked for; and the distance from the point to
         which rays look, in metres.
 
-        which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is.
+        which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is, 2:
+            through those of the group of points of narrow lobes whose turn it is.
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
         above = MARGIN * (0.5 * LIFT + MAX_SAG) * distance
         group = dr.select(which == 0, 0, turn // self.every % self.groups + 1)
+        if self.has_lobes:
+            group = dr.select(which == 2, 1 + self.groups + lobe_turn % LOBE_GROUPS, group)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
         place = mi.Point3f(point) - self.middle + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))

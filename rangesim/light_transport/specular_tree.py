@@ -7,11 +7,15 @@ surfaces that it met and on the choices between reflection and refraction. Chain
 points differ smoothly.
 
 A launch follows every ray along its stronger part. The weaker parts are stored, and are the rays of the next launch.
+
+Polished metal is no mirror: it scatters light into a narrow lobe. There a ray splits into `LOBE_POINTS` parts, one for
+each point of a fixed set over the unit square, from which the BSDF samples its lobe. For one of these points, the metal
+is a mirror whose normal is turned a little, and its chains differ as smoothly as others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -19,8 +23,9 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.camera_rays import Device, PrimaryRay
+from rangesim.light_transport.delta_surfaces import has_throwers, is_thrower
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.sampling import Continued
+from rangesim.light_transport.sampling import R2, Continued, aligned
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray
 from rangesim.light_transport.strategies import can_be_vertex, is_delta
@@ -41,6 +46,12 @@ HASH_STEP = 0x9E3779B1
 NORMAL_STEPS = 1000.0
 """Number of steps per unit to which the normals of flat faces are rounded in a key, so that light through different
 faces of a mesh has different keys; faces closer than 0.06 degrees count as one."""
+LOBE_POINTS = 64
+"""Number of directions, a power of two, into which a narrow lobe sends light. The edge of what one of them lights is a
+step of a 64th of the light; with a quarter of them, steps would show in the pattern."""
+LOBE_TURN = 26
+"""Even number that decides how the points of the lobes at successive surfaces are combined, so that all pairs are
+spread evenly."""
 EXACT_BSDFS = ("SmoothDielectric", "ThinDielectric", "SmoothConductor", "SmoothPlastic", "Null")
 """Class names of BSDFs whose delta lobes can be asked for one by one, each with its exact weight; `twosided` around
 them is exact as well. Blends and masks choose by chance."""
@@ -55,6 +66,8 @@ class Parts(NamedTuple):
     state : RayState.
     key : UInt32, name of the chain so far.
     chain : UInt32, number of delta interactions so far.
+    lobe : UInt32, number of the point of the lobes, from 1 on; 0 if the light met no narrow lobe. None in scenes
+        without such lobes.
     random : UInt64, state of the random numbers; None for points of the grid.
     """
 
@@ -65,6 +78,7 @@ class Parts(NamedTuple):
     state: RayState
     key: mi.UInt32
     chain: mi.UInt32
+    lobe: mi.UInt32
     random: mi.UInt64 = None
 
 
@@ -74,6 +88,7 @@ class Landings(NamedTuple):
     point : (m,) uint32, index of the point of the image.
     key : (m,) uint32, name of the chain and of the shape that it ends on.
     shape : (m,) uint32, number of that shape (`surfaces.number_of`).
+    lobe : (m,) uint32, number of the point of the narrow lobes that the light met, from 1 on; 0 if it met none.
     part : (m,) float32, fraction of the light of the point.
     length : (m,) float32, metres, optical length.
     ior : (m,) float32, refractive index in front of the surface.
@@ -83,6 +98,7 @@ class Landings(NamedTuple):
     point: np.ndarray
     key: np.ndarray
     shape: np.ndarray
+    lobe: np.ndarray
     part: np.ndarray
     length: np.ndarray
     ior: np.ndarray
@@ -98,15 +114,19 @@ class SpecularTree:
     ----------
     traced : TracedScene, whose emitter is a projector.
     launches : Launches.
+    seed : int, 0 to 2^64 - 1, decides how the points of narrow lobes are shifted.
     """
 
-    def __init__(self, traced: TracedScene, launches: Launches) -> None:
+    def __init__(self, traced: TracedScene, launches: Launches, seed: int = 0) -> None:
         shapes = traced.scene.shapes()
         self.traced, self.launches = traced, launches
         # Keys name shapes by their order in the scene: their own numbers depend on what else the process has loaded
         self.order = mi.UInt32(table_of(traced.scene, np.arange(len(shapes), dtype=np.uint32)))
         self.is_flat = mi.Bool(table_of(traced.scene, [_is_flat(shape) for shape in shapes]))
         self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
+        self.has_lobes = has_throwers(traced.scene)
+        self.has_lobe = mi.Bool(table_of(traced.scene, list(map(is_thrower, shapes))))
+        self.lobe_points = mi.Float(aligned(lobe_points(seed), np.float32))
         self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
 
     def follow(
@@ -138,23 +158,29 @@ class SpecularTree:
         origin = mi.Point3f(primary.origin) + dr.zeros(mi.Point3f, n)
         none = dr.zeros(mi.UInt32, n)
         parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
-                      random)  # fmt: skip
+                      mi.UInt32(none) if self.has_lobes else None, random)  # fmt: skip
         # All parts share an increment; their states differ
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
         dropped, found = np.zeros(n), []
         launches = LAUNCHES if random is None else LAUNCHES_OF_PHOTONS
+        launches += self.has_lobes
         for left in reversed(range(launches)):
             self.room = dr.opaque(mi.UInt32, PARTS if left else 0)
             leaves = _leaves(parts)
             dr.make_opaque(leaves)
             parts = _rebuilt(parts, list(leaves))
             lanes = dr.width(parts.part)
-            stored = _Stored(leaves, lanes)
+            stored = _Stored(leaves, lanes, PARTS + self.has_lobes)
             landing, lost = _strongest(self, parts, stored, chance)
             self.launches.evaluate([landing, stored.leaves, lost], lanes)
+            if self.has_lobes:  # a point of a lobe has a fraction of its light
+                share = dr.select(parts.lobe > 0, 1 / LOBE_POINTS, 1)
+                landing.part, lost = landing.part * share, lost * share
             dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
             landed = dr.compress(landing.part > 0)
+            if landing.lobe is None:
+                landing.lobe = dr.zeros(mi.UInt32, lanes)
             columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
             dr.eval(columns)
             found.append([x.numpy() for x in columns])
@@ -162,9 +188,11 @@ class SpecularTree:
             if not len(rest):
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
+            if self.has_lobes:
+                parts = _in_lobes(parts)
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
-        vectors = [np.column_stack(numbers[k : k + 3]) for k in (6, 9, 12)]
-        return Landings(*numbers[:6], *vectors), dropped
+        vectors = [np.column_stack(numbers[k : k + 3]) for k in (7, 10, 13)]
+        return Landings(*numbers[:7], *vectors), dropped
 
 
 @dataclass
@@ -173,6 +201,7 @@ class _Landing:
 
     key: mi.UInt32
     shape: mi.UInt32
+    lobe: mi.UInt32
     part: mi.Float
     length: mi.Float
     ior: mi.Float
@@ -188,12 +217,13 @@ class _Stored:
     ----------
     like : leaves of `Parts`.
     lanes : int.
+    room : int, number of parts of a lane.
     """
 
-    def __init__(self, like: list[Any], lanes: int) -> None:
+    def __init__(self, like: list[Any], lanes: int, room: int) -> None:
         self.lane, self.lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, lanes)
-        self.leaves = [dr.empty(type(x), PARTS * lanes) for x in like]
-        self.leaves[PART_LEAF] = dr.zeros(mi.Float, PARTS * lanes)
+        self.leaves = [dr.empty(type(x), room * lanes) for x in like]
+        self.leaves[PART_LEAF] = dr.zeros(mi.Float, room * lanes)
 
     @property
     def part(self) -> mi.Float:
@@ -209,6 +239,33 @@ class _Stored:
 
 PART_LEAF = 1
 """Place of `part` among the leaves of `Parts`."""
+
+
+STREAM_STEP = 0x9E3779B97F4A7C15
+"""Difference between random states of parts of a photon: 2^64 divided by the golden ratio, rounded to an odd number."""
+NEEDS_LOBE = 0xFFFFFFFF
+"""Value of `Parts.lobe` of a ray that is about to meet its first narrow lobe."""
+
+
+def lobe_points(seed: int) -> np.ndarray:
+    """(LOBE_POINTS, 2) float64, the points of the unit square from which narrow lobes are sampled.
+
+    They follow the R2 sequence, so that any few of them in a row are spread over the square as well. The seed shifts
+    all of them alike.
+    """
+    return np.asarray((np.random.default_rng(seed).random(2) + np.outer(np.arange(LOBE_POINTS), R2)) % 1.0)
+
+
+def _in_lobes(parts: Parts) -> Parts:
+    """The parts, with one for each point of the lobes instead of those that are about to meet their first narrow
+    lobe."""
+    lobe = parts.lobe.numpy()
+    others, met = np.flatnonzero(lobe != NEEDS_LOBE), np.flatnonzero(lobe == NEEDS_LOBE)
+    source = mi.UInt32(aligned(np.concatenate([others, np.repeat(met, LOBE_POINTS)]), np.uint32))
+    points = np.tile(np.arange(1, LOBE_POINTS + 1), len(met))
+    parts = _rebuilt(parts, [dr.gather(type(x), x, source) for x in _leaves(parts)])
+    parts = parts._replace(lobe=mi.UInt32(aligned(np.concatenate([lobe[others], points]), np.uint32)))
+    return parts if parts.random is None else parts._replace(random=parts.random + mi.UInt64(parts.lobe) * STREAM_STEP)
 
 
 @dr.syntax
@@ -227,18 +284,31 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     reflects.type_mask = mi.BSDFFlags.DeltaReflection
     transmits.type_mask = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null
     any_lobe.type_mask = mi.BSDFFlags.Delta
+    if dr.hint(tree.has_lobes, mode="scalar"):
+        reflects.type_mask |= mi.BSDFFlags.GlossyReflection
+        transmits.type_mask |= mi.BSDFFlags.GlossyTransmission
 
     origin, direction, state = parts.origin, parts.direction, parts.state
-    part, key, chain, random = parts.part, parts.key, parts.chain, parts.random
+    part, key, chain, lobe, random = parts.part, parts.key, parts.chain, parts.lobe, parts.random
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
     none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
     part_0, length_0, ior_0 = (dr.zeros(mi.Float, n) for _ in range(3))
     landing = _Landing(
-        none, mi.UInt32(none), part_0, length_0, ior_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
+        none,
+        mi.UInt32(none),
+        None if lobe is None else mi.UInt32(none),
+        part_0,
+        length_0,
+        ior_0,
+        dr.zeros(mi.Point3f, n),
+        vector,
+        mi.Vector3f(vector),
     )
     active = part > 0
     while active:
+        if dr.hint(tree.has_lobes, mode="scalar"):
+            before, part_before = replace(state), mi.Float(part)
         # ---- Next surface ----------------------------------------------------------------------------
         ray = mi.Ray3f(origin, direction)
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
@@ -253,20 +323,37 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         bsdf, shape = si.bsdf(ray), number_of(si.shape)
         order = dr.gather(mi.UInt32, tree.order, shape, hit)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        throws, defers, xi = mi.Bool(False), mi.Bool(False), mi.Point2f(0.5, 0.5)
+        if dr.hint(tree.has_lobes, mode="scalar"):
+            throws = hit & dr.gather(mi.Bool, tree.has_lobe, shape, hit)
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
+        if dr.hint(tree.has_lobes, mode="scalar"):
+            lands &= ~throws | (lobe == 0)
         name = (key ^ order) * HASH_STEP
-        here = _Landing(name, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
+        here = _Landing(name, shape, lobe, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
         landing = dr.select(lands, here, landing)
+
+        # ---- At its first narrow lobe, light waits to be split into the points of the lobe -------------
+        if dr.hint(tree.has_lobes, mode="scalar"):
+            defers = throws & (lobe == 0)
+            stored.add(Parts(parts.point, part_before, origin, direction, before, key, chain, mi.UInt32(NEEDS_LOBE),
+                             random), mi.UInt32(PARTS), defers & (tree.room > 0))  # fmt: skip
+            lost += dr.select(defers & (tree.room == 0), part, 0)
+            lobe = dr.select(defers, NEEDS_LOBE, lobe)
+            mirrors = (mirrors | throws) & ~defers
+            of_lobe = ((lobe - 1) * (LOBE_TURN * chain + 1)) % LOBE_POINTS
+            xi = dr.select(throws, dr.gather(mi.Point2f, tree.lobe_points, of_lobe, throws & ~defers), xi)
+            key = dr.select(throws & ~defers, (key ^ lobe) * HASH_STEP, key)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
         face = dr.round(si.n * NORMAL_STEPS)
         face = [mi.UInt32(mi.Int32(x)) for x in (face.x, face.y, face.z)]
         place = order + dr.select(dr.gather(mi.Bool, tree.is_flat, shape, hit), _mixed(face), 0)
-        splits = mirrors & (dr.gather(mi.Bool, tree.is_exact, shape, hit) | crosses)
-        bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
-        bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), mi.Point2f(0.5, 0.5), splits)
+        splits = mirrors & (dr.gather(mi.Bool, tree.is_exact, shape, hit) | crosses | throws)
+        bs_r, weight_r = bsdf.sample(reflects, si, mi.Float(0.5), xi, splits)
+        bs_t, weight_t = bsdf.sample(transmits, si, mi.Float(0.5), xi, splits)
         part_r, part_t = (dr.select(splits, part * mono(w), 0) for w in (weight_r, weight_t))
         if dr.hint(numbers is not None, mode="scalar"):
             rng = numbers.at(random)
@@ -307,7 +394,8 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             lost += dr.select(stronger < tree.fewest, stronger, 0)
             stronger = dr.select(stronger < tree.fewest, 0, stronger)
         aside = Parts(parts.point, kept, dr.select(turns, o_t, o_r), dr.select(turns, d_t, d_r),
-                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, random)  # fmt: skip
+                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, lobe,
+                      random)  # fmt: skip
         stored.add(aside, number, kept > 0)
         number += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
         part, key = stronger, dr.select(turns, key_r, key_t)
