@@ -483,8 +483,8 @@ def lifted(sheets, scale, is_faint, fixed, chance, salt, numbers, lift, flat_lif
     is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept; it then counts for
         those that are not. salt : uint64, a random number of the pass.
     fixed : (t,) int64, number of the group of a triangle of a narrow lobe; 0 for others.
-    numbers : groups, every, lobe_groups: numbers of groups of faint triangles, of samples of which one looks for
-        them, and of groups of points of narrow lobes.
+    numbers : groups, every, per_lobe: numbers of groups of faint triangles, of samples of which one looks for them, and
+        of samples of which one looks for the triangle of a narrow lobe.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (1 + groups + lobe_groups, 2) float64, metres, of bright triangles, of the groups of faint ones, and of
@@ -498,18 +498,17 @@ def lifted(sheets, scale, is_faint, fixed, chance, salt, numbers, lift, flat_lif
         1 where the receiver is flat.
     """
     position, normal, triangles, shape, key, image = sheets
-    groups, every, lobe_groups = numbers
+    groups, every, per_lobe = numbers
     name = _names_of(triangles, key, image)
     corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
     terms, n = np.empty((len(triangles), 3), np.float32), 0
     for t in range(len(triangles)):
         group, weight = fixed[t], 1.0
-        if group > 0:
-            weight = float(lobe_groups)
-        elif is_faint[t]:
+        if group > 0 or is_faint[t]:
             if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
                 continue
-            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
+            weight = (per_lobe if group > 0 else groups * every) / chance[t]
+            group = group if group > 0 else 1 + (key[t] >> 8) % groups
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]

@@ -33,10 +33,10 @@ from rangesim.light_transport.caustic_kernels import (
     sides_of_photons,
     smooth_chains,
 )
-from rangesim.light_transport.delta_surfaces import meets_delta, sends_on
+from rangesim.light_transport.delta_surfaces import has_throwers, is_thrower, meets_delta, sends_on
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
-from rangesim.light_transport.specular_tree import HASH_STEP, LOBE_POINTS, Landings, SpecularTree
+from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
 
@@ -69,7 +69,7 @@ PHOTONS = 1 << 13
 """Number of photons of a pass, as far as cells that are left can be divided into parts of their own. If there are more
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
 PHOTONS_WITH_LOBES = 1 << 11
-"""The same in scenes with narrow lobes, which send each photon into `LOBE_POINTS` directions."""
+"""The same in scenes with narrow lobes, which send each photon into many directions."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
 MAX_SAG = 1e-3
@@ -276,7 +276,6 @@ class _Tracing:
     def __init__(self, traced: TracedScene, pixel_rad: float, seed: int, report: Callable[[], None]) -> None:
         assert isinstance(traced.projector, Device)
         self.device, self.report = traced.projector, report
-        self.tree = SpecularTree(traced, Launches(), seed)
         width, height = (int(n[0]) for n in self.device.size)
         self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
         levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
@@ -288,12 +287,10 @@ class _Tracing:
         self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
         cells = CellGrid.of(self.device)
-        meets, _ = meets_delta(
-            traced.scene,
-            cells.columns * cells.rows,
-            lambda a, b: self.device.centre_ray(cells.probes(a, b)),
-            sends_on,
-        )
+        probes = cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
+        meets, _ = meets_delta(traced.scene, *probes, sends_on)
+        lobe_pixels = meets_delta(traced.scene, *probes, is_thrower)[0].mean() if has_throwers(traced.scene) else 0.0
+        self.tree = SpecularTree(traced, Launches(), seed, lobe_pixels * self.device.pixels)
         self.delta = _Delta(
             maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
         )
@@ -405,7 +402,7 @@ class _Tracing:
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
         found, lost = [_no_landings()], [np.empty(0)]
-        at_once = MAX_AT_ONCE // (LOBE_POINTS if self.tree.has_lobes else 1)
+        at_once = MAX_AT_ONCE // (self.tree.points if self.tree.has_lobes else 1)
         for begin in range(0, len(pixels), at_once):
             some = slice(begin, begin + at_once)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))

@@ -105,11 +105,13 @@ def caustic_light(
     si, bsdf = vertex.si, vertex.bsdf
     shape, normal = number_of(si.shape), mi.Normal3f(si.n)
     seen = dr.dot(si.to_world(si.wi), si.n)
-    radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+    radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.full(mi.UInt32, sheets.first, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
     # Later vertices bring little each, so they look in some samples alone, which count for all
     is_turn = sheets.is_turn(turn, dr.select(is_later, mi.UInt32(1), 0))
     looks = sheets.may_light(si.p, shape, active & (~is_later | is_turn))
+    if dr.hint(sheets.first == 2 and sheets.lobes_in_turn, mode="scalar"):
+        looks &= is_turn
     weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
@@ -122,7 +124,7 @@ def caustic_light(
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, ray.maxt - found.t - above, above, shape, normal, is_new)
-        irradiance *= dr.select(which != 1, weight_of_bright, 1)
+        irradiance *= dr.select((which == 0) | ((which == 2) & (not sheets.lobes_in_turn)), weight_of_bright, 1)
         total += irradiance
         fraction = dr.select(is_here, irradiance / total, 0)
         taken = is_here & ((which == 0) | (pick < fraction))
@@ -147,7 +149,7 @@ def caustic_light(
         way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
         if dr.hint(sheets.has_lobes, mode="scalar"):
-            which = dr.select((which == 1) & ~is_turn, 2, which)
+            which = dr.select((which == 1) & ~is_turn, 3 if sheets.lobes_in_turn else 2, which)
             looks &= which <= 2
         else:
             looks &= (which == 0) | ((which == 1) & is_turn)

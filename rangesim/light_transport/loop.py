@@ -370,7 +370,7 @@ class Lanes:
     def lobe_turn(self, number: mi.UInt32) -> mi.UInt32:
         """Number of a sample among all of its pixel, after a start that differs from pixel to pixel; it decides which
         points of narrow lobes the sample looks for."""
-        return number + (dr.reinterpret_array(mi.UInt32, self.shift.y) >> 4) % TURNS
+        return number + (dr.reinterpret_array(mi.UInt32, self.shift.x) >> 4) % TURNS
 
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:

@@ -23,7 +23,7 @@ import numpy as np
 from rangesim.light_transport.caustic_kernels import crowd_of, irradiance_of, lifted
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
-from rangesim.light_transport.specular_tree import LOBE_POINTS
+from rangesim.light_transport.specular_tree import LOBE_GROUPS
 
 LIFT = 4e-4
 """Largest distance between two triangles in one place, as a fraction of their distance from the projector: a thousand
@@ -46,9 +46,9 @@ a longer period, faint light would be noisy in passes of few samples."""
 EVERY = 4
 """Largest number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
 longer."""
-LOBE_GROUPS = 16
-"""Number of groups of the points of narrow lobes. A sample of a pixel looks into one group, so 16 samples look into all
-of them once."""
+FAINT_LOBES = 0.5
+"""Fraction of the light of narrow lobes that may be bright while samples look for it in turn, so that this light is not
+noisy where there is much of it."""
 CROWD = 2.0
 """Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
 fewer of them at little cost."""
@@ -134,7 +134,12 @@ class SheetScene:
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
+        # Faint light of lobes is looked for in some samples alone, unless some of it is bright
         self.has_lobes = bool(sheets.lobe.any())
+        is_bright = level * sheets.lobe.max() >= FAINT
+        bright, of_lobes = (float(sheets.flux[(sheets.lobe > 0) & which].sum()) for which in (is_bright, np.True_))
+        self.lobes_in_turn = bright <= FAINT_LOBES * of_lobes
+        self.first = 2 if sheets.lobe.all() else 0  # through what samples look first, as `which` of `ray`
         places_needed = 1 + groups + self.has_lobes * LOBE_GROUPS
         across = math.isqrt(places_needed - 1) + 1  # all of them lie in a square
         places = [[g % across, g // across] for g in range(across**2)]
@@ -147,12 +152,10 @@ class SheetScene:
         weak = np.flatnonzero(is_faint)
         crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
         is_faint[weak[crowd < CROWD]] = False
-        # Points of a lobe in a row are spread over it, so each group stands for all of it
-        of_lobe = (sheets.lobe.astype(np.int64) - 1) * LOBE_GROUPS // LOBE_POINTS
-        fixed = np.where(sheets.lobe > 0, 1 + groups + of_lobe, 0)
+        fixed = np.where(sheets.lobe > 0, 1 + groups + (sheets.lobe.astype(np.int64) - 1) % LOBE_GROUPS, 0)
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
-        numbers = groups, every, LOBE_GROUPS
+        numbers = groups, every, LOBE_GROUPS * (every if self.lobes_in_turn else 1)
         corners, names, terms = lifted(
             columns, scale, is_faint, fixed, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
         )

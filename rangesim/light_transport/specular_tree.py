@@ -47,8 +47,14 @@ NORMAL_STEPS = 1000.0
 """Number of steps per unit to which the normals of flat faces are rounded in a key, so that light through different
 faces of a mesh has different keys; faces closer than 0.06 degrees count as one."""
 LOBE_POINTS = 64
-"""Number of directions, a power of two, into which a narrow lobe sends light. The edge of what one of them lights is a
-step of a 64th of the light; with a quarter of them, steps would show in the pattern."""
+"""Largest number of directions, a power of two, into which a narrow lobe sends light. The edge of what one of them
+lights is a step of a 64th of the light."""
+LOBE_GROUPS = 16
+"""Number of groups of these directions, and the smallest number of directions. A sample of a pixel looks for the light
+of one group, so 16 samples look for all of it once."""
+LOBE_RAYS = 1 << 20
+"""Number of rays from pixels of the projector that meet narrow lobes, times the directions of each, up to which there
+are `LOBE_POINTS`. With more, many metal parts would take ten times as long as all the rest of a pass."""
 LOBE_TURN = 26
 """Even number that decides how the points of the lobes at successive surfaces are combined, so that all pairs are
 spread evenly."""
@@ -115,9 +121,10 @@ class SpecularTree:
     traced : TracedScene, whose emitter is a projector.
     launches : Launches.
     seed : int, 0 to 2^64 - 1, decides how the points of narrow lobes are shifted.
+    lobe_pixels : number of the projector's pixels whose light meets narrow lobes first.
     """
 
-    def __init__(self, traced: TracedScene, launches: Launches, seed: int = 0) -> None:
+    def __init__(self, traced: TracedScene, launches: Launches, seed: int = 0, lobe_pixels: float = 0.0) -> None:
         shapes = traced.scene.shapes()
         self.traced, self.launches = traced, launches
         # Keys name shapes by their order in the scene: their own numbers depend on what else the process has loaded
@@ -126,7 +133,11 @@ class SpecularTree:
         self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
         self.has_lobes = has_throwers(traced.scene)
         self.has_lobe = mi.Bool(table_of(traced.scene, list(map(is_thrower, shapes))))
-        self.lobe_points = mi.Float(aligned(lobe_points(seed), np.float32))
+        self.points = LOBE_POINTS
+        while self.points > LOBE_GROUPS and self.points * lobe_pixels > LOBE_RAYS:
+            self.points //= 2
+        self.lobe_points = mi.Float(aligned(lobe_points(self.points, seed), np.float32))
+        self.last_point = dr.opaque(mi.UInt32, self.points - 1)
         self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
 
     def follow(
@@ -175,7 +186,7 @@ class SpecularTree:
             landing, lost = _strongest(self, parts, stored, chance)
             self.launches.evaluate([landing, stored.leaves, lost], lanes)
             if self.has_lobes:  # a point of a lobe has a fraction of its light
-                share = dr.select(parts.lobe > 0, 1 / LOBE_POINTS, 1)
+                share = dr.select(parts.lobe > 0, 1 / self.points, 1)
                 landing.part, lost = landing.part * share, lost * share
             dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
             landed = dr.compress(landing.part > 0)
@@ -189,7 +200,7 @@ class SpecularTree:
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
             if self.has_lobes:
-                parts = _in_lobes(parts)
+                parts = _in_lobes(parts, self.points)
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
         vectors = [np.column_stack(numbers[k : k + 3]) for k in (7, 10, 13)]
         return Landings(*numbers[:7], *vectors), dropped
@@ -247,24 +258,25 @@ NEEDS_LOBE = 0xFFFFFFFF
 """Value of `Parts.lobe` of a ray that is about to meet its first narrow lobe."""
 
 
-def lobe_points(seed: int) -> np.ndarray:
-    """(LOBE_POINTS, 2) float64, the points of the unit square from which narrow lobes are sampled.
+def lobe_points(points: int, seed: int) -> np.ndarray:
+    """(points, 2) float64, the points of the unit square from which narrow lobes are sampled.
 
-    They follow the R2 sequence, so that any few of them in a row are spread over the square as well. The seed shifts
-    all of them alike.
+    They are those of the R2 sequence. Point i belongs to group i modulo `LOBE_GROUPS`; a group has some points of the
+    sequence in a row, which are spread over the square. The seed shifts all points alike.
     """
-    return np.asarray((np.random.default_rng(seed).random(2) + np.outer(np.arange(LOBE_POINTS), R2)) % 1.0)
+    number = np.arange(points).reshape(LOBE_GROUPS, -1).T.ravel()
+    return np.asarray((np.random.default_rng(seed).random(2) + np.outer(number, R2)) % 1.0)
 
 
-def _in_lobes(parts: Parts) -> Parts:
+def _in_lobes(parts: Parts, points: int) -> Parts:
     """The parts, with one for each point of the lobes instead of those that are about to meet their first narrow
     lobe."""
     lobe = parts.lobe.numpy()
     others, met = np.flatnonzero(lobe != NEEDS_LOBE), np.flatnonzero(lobe == NEEDS_LOBE)
-    source = mi.UInt32(aligned(np.concatenate([others, np.repeat(met, LOBE_POINTS)]), np.uint32))
-    points = np.tile(np.arange(1, LOBE_POINTS + 1), len(met))
+    source = mi.UInt32(aligned(np.concatenate([others, np.repeat(met, points)]), np.uint32))
+    chosen = np.tile(np.arange(1, points + 1), len(met))
     parts = _rebuilt(parts, [dr.gather(type(x), x, source) for x in _leaves(parts)])
-    parts = parts._replace(lobe=mi.UInt32(aligned(np.concatenate([lobe[others], points]), np.uint32)))
+    parts = parts._replace(lobe=mi.UInt32(aligned(np.concatenate([lobe[others], chosen]), np.uint32)))
     return parts if parts.random is None else parts._replace(random=parts.random + mi.UInt64(parts.lobe) * STREAM_STEP)
 
 
@@ -343,7 +355,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             lost += dr.select(defers & (tree.room == 0), part, 0)
             lobe = dr.select(defers, NEEDS_LOBE, lobe)
             mirrors = (mirrors | throws) & ~defers
-            of_lobe = ((lobe - 1) * (LOBE_TURN * chain + 1)) % LOBE_POINTS
+            of_lobe = ((lobe - 1) * (LOBE_TURN * chain + 1)) & tree.last_point
             xi = dr.select(throws, dr.gather(mi.Point2f, tree.lobe_points, of_lobe, throws & ~defers), xi)
             key = dr.select(throws & ~defers, (key ^ lobe) * HASH_STEP, key)
 
