@@ -34,11 +34,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from caustic_energy import biconvex, triangular_prism, written
 from plain_mitsuba import plain_scene, render, show
-from reference_scenes import GLASS, MATTE
+from reference_scenes import GLASS, MATTE, enlarged
 
 from rangesim import Intrinsics, Rig, Scene, StructuredLight, load_scene, look_at, transport
 from rangesim.environment.backend import select_variant
 from rangesim.response import Images
+from rangesim.scene.camera import MITSUBA_FROM_OPENCV
 
 FILM = {"type": "hdrfilm", "pixel_format": "luminance"}
 FOCUS_PIXELS = 12
@@ -77,16 +78,17 @@ def timed(work: Callable[[], np.ndarray]) -> tuple[np.ndarray, float]:
 # ---- Noise ------------------------------------------------------------------------------------------
 
 
-def ball_over_a_plane() -> tuple[Scene, Rig]:
-    """The plane is near the ball's focus, which the camera sees beside the ball."""
+def ball_over_a_plane(is_large: bool = False) -> tuple[Scene, Rig]:
+    """The plane is near the ball's focus, which the camera sees beside the ball.
+
+    `is_large`: as large as the reference needs it (`reference_scenes.ENLARGEMENT`).
+    """
     select_variant()  # before Mitsuba's transforms
     import mitsuba as mi
 
     eye, up = (-0.1, -0.5, 0.4), (0.0, 0.0, 1.0)
-    to_world = mi.ScalarTransform4f().look_at(list(eye), [0, 0, 0], list(up))
     plane = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(0.3), "bsdf": MATTE}
     ball = {"type": "sphere", "center": [0.01, 0.0, 0.09], "radius": 0.05, "bsdf": GLASS}
-    sensor = {"type": "perspective", "fov": 20.0, "to_world": to_world}
     T_world_camera = look_at(eye, (0.0, 0.0, 0.0), up)
     rig = Rig(
         camera=Intrinsics.from_fov(320, 240, 20),
@@ -94,7 +96,13 @@ def ball_over_a_plane() -> tuple[Scene, Rig]:
         T_world_camera=T_world_camera,
         T_camera_projector=np.linalg.inv(T_world_camera) @ look_at((0.08, 0.03, 0.6), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     )
-    return load_scene({"type": "scene", "sensor": sensor, "plane": plane, "ball": ball}), rig
+    shapes = {"plane": plane, "ball": ball}
+    if is_large:
+        shapes, rig = enlarged(shapes, rig, ball["center"])
+    to_world = mi.ScalarTransform4f(rig.T_world_camera @ MITSUBA_FROM_OPENCV)
+    return load_scene(
+        {"type": "scene", "sensor": {"type": "perspective", "fov": 20.0, "to_world": to_world}, **shapes}
+    ), rig
 
 
 def noise(seeds: int) -> dict[str, float]:
@@ -103,7 +111,7 @@ def noise(seeds: int) -> dict[str, float]:
 
     scene, rig = ball_over_a_plane()
     white = Images(np.ones((1, rig.projector.height, rig.projector.width), np.float32))
-    plain, integrator = plain_scene(scene, rig, FILM), mi.load_dict({"type": "ptracer"})
+    plain, integrator = plain_scene(*ball_over_a_plane(is_large=True), FILM), mi.load_dict({"type": "ptracer"})
     sides: dict[str, Callable[[int], np.ndarray]] = {
         "ours": lambda seed: transport(scene, rig, [white], seed=seed).channels[white][0],
         "ptracer": lambda seed: render(plain, integrator, PTRACER_SPP, seed),

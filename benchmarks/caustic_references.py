@@ -66,7 +66,8 @@ def ptracer(case: Case, scale: float) -> Reference:
     import mitsuba as mi
     from finite_aperture import MAX_SURFACES
 
-    plain = plain_scene(case.scene, case.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
+    large = case.enlarged()
+    plain = plain_scene(large.scene, large.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
     integrator = mi.load_dict({"type": "ptracer", "max_depth": MAX_SURFACES, "rr_depth": MAX_SURFACES})
     light, frames = stripes()
     halves = np.empty((2, len(frames), case.rig.camera.height, case.rig.camera.width))
@@ -87,15 +88,16 @@ def path(case: Case, scale: float) -> Reference:
     light, frames = stripes()
     patterns = light.patterns()[frames[1:]]
     spp = max(1, int(PATH_SAMPLES * scale) // (2 * len(pixels)))
+    large = case.enlarged()
     h, w = case.rig.camera.height, case.rig.camera.width
     halves = np.full((2, len(frames), h, w), np.nan)
     for half in range(2):
         seed = half << 32 | sum(map(ord, str(pixels.shape)))
         point, wide = (
             finite_aperture(
-                case.scene.mitsuba,
-                Lamp(case.rig, factor * case.aperture_radius_m, case.focus_m, patterns),
-                case.guide,
+                large.scene.mitsuba,
+                Lamp(large.rig, factor * large.aperture_radius_m, large.focus_m, patterns),
+                large.guide,
                 pixels,
                 spp // factor**2,
                 seed + factor,

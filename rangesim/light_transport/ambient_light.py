@@ -51,7 +51,7 @@ def sampled_ambient(
     `ray_state` is the state of the ray that met `si`; `xi` is uniform in the unit square.
     """
     ds, radiance = traced.scene.sample_emitter_direction(si, xi, True, active)
-    active &= ds.pdf != 0
+    active = active & (ds.pdf != 0)  # `&=` would change the mask of the caller
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
     absorbers = traced.absorbers
@@ -84,7 +84,7 @@ def sampled_ambient_through_media(
     assert media is not None
     assert inside is not None
     ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
-    active &= ds.pdf != 0
+    active = active & (ds.pdf != 0)  # `&=` would change the mask of the caller
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
     value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
     around = None if absorbers is None else absorbers.beyond(si, ds.d, ray_state.sigma_a, active & ~scatters)

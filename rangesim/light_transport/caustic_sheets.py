@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors, as triangles on the surfaces where it lands.
+"""Light beyond glass and mirrors, as triangles on the surfaces where it lands.
 
 The projector is a point, so the place where a chain of delta interactions ends is a smooth function of the place in the
-image where it began. A grid of points over the image is traced through the scene (`specular_tree`). Where the points
-around a cell of the grid took the same chain, they span triangles on the surface where they landed. The irradiance of a
-triangle is its flux over its area, and everything else is interpolated between its corners. Cells are divided where
-triangles would be too coarse.
+image where it began. The same holds for all sources without extent (`delta_sources`). A grid of points over the image
+is traced through the scene (`specular_tree`). Where the points around a cell of the grid took the same chain, they span
+triangles on the surface where they landed. The irradiance of a triangle is its flux over its area, and everything else
+is interpolated between its corners. Cells are divided where triangles would be too coarse.
 
 The rest, mostly along the silhouettes of glass, is left to photons: random points of the cells, each of which carries
 the light of its cell over the parallelogram to which the derivatives of the place by the point spread the cell (photon
@@ -28,17 +28,21 @@ from rangesim.light_transport.caustic_kernels import (
     EMPTY,
     cells_of,
     larger,
+    last_ways,
     linked,
     new_points,
     sides_of_photons,
     smooth_chains,
+    with_names,
 )
-from rangesim.light_transport.delta_surfaces import has_throwers, is_thrower, meets_delta, sends_on
+from rangesim.light_transport.delta_sources import DeltaSource, ProjectorSource
+from rangesim.light_transport.delta_surfaces import has_throwers, meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
-from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
-from rangesim.light_transport.surfaces import number_of
+from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree, lobe_points
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.scene.materials import is_specular
 
 BLOCK_PX = 8.0
 """Edge of the largest blocks, in pixels of the projector; a block has two cells along each edge. Rays that find glass
@@ -81,6 +85,12 @@ farther does not do so evenly."""
 HALVINGS = 4
 """Largest number of times that the parallelogram of a photon is halved until all of it lies on the receiver. Light that
 hangs over an edge is lost; with four, it is a sixteenth of what it would be with none."""
+NEAREST = 0.02
+"""Fraction of the way from glass to the receiver after which rays look for things in between, so that they start beyond
+the glass even where it is curved. Things nearer to the glass are found by points of the grid alone."""
+FLAT = 0.02
+"""Largest distance of a flat receiver from where light between points of the grid lands, as a fraction of `MAX_SAG`:
+ten times the rounding of single precision."""
 SHIFT_PX = np.array([0.0137, 0.0071])
 """Largest shift of the lattice against the edges of pixels, in pixels: more than rounding, less than anything seen."""
 BEND = 0.01
@@ -91,11 +101,6 @@ MIN_SIDE_M = 1e-12
 STEP_PX = 0.02
 """Distance of the points beside a photon that tell how its light spreads, in pixels of the projector. Closer points
 would land within the rounding of single precision; farther ones would miss narrow chains."""
-LENS_RADIUS, LENS_WEIGHTS = np.sqrt(2 / 3), (1 / 4, *[1 / 8] * 6)
-"""Points of a lens of finite size, each of which has a grid of its own, at the lowest level: its centre and a regular
-hexagon. Radius of the hexagon as a fraction of the lens, and fractions of the light. Means over these points are exact
-for polynomials of the place on the lens up to degree 5 (Stroud, Approximate calculation of multiple integrals, 1971,
-rule S2: 5-1), so light lands where it should on average, and blurs as much."""
 MAX_AT_ONCE = 1 << 18
 """Largest number of points of a launch, so that the weaker parts that it stores take 100 MB at most."""
 
@@ -133,9 +138,11 @@ class Lists(NamedTuple):
 class Rule(NamedTuple):
     """The numbers that decide whether a block is divided, see `TOLERANCE_PX`, `FAINT` and `SIGNIFICANT`.
 
-    `angle` is that of a pixel in radians, `projector_at` the place of the projector (3,) and `sag` is `MAX_SAG`."""
+    `pixel_m` and `pixel_rad` tell the size of a pixel's light, see `DeltaSource`; `projector_at` is the place of the
+    projector (3,) and `sag` is `MAX_SAG`."""
 
-    angle: float
+    pixel_m: float
+    pixel_rad: float
     projector_at: np.ndarray
     sag: float
     tolerance: float
@@ -147,10 +154,32 @@ class Chains(NamedTuple):
     """The columns of `Landings` that decide about triangles."""
 
     key: np.ndarray
+    shape: np.ndarray
     part: np.ndarray
     length: np.ndarray
+    last: np.ndarray
     position: np.ndarray
     normal: np.ndarray
+    direction: np.ndarray
+
+
+class Pairs(NamedTuple):
+    """Pairs of a block or a cell and a chain that may make triangles, see `smooth_chains`."""
+
+    triangles: np.ndarray
+    flux: np.ndarray
+    names: np.ndarray
+    parts: np.ndarray
+
+    def triangles_of(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles and flux of the pairs in a mask (p,)."""
+        each = len(self.triangles) // max(len(self.names), 1)
+        rows = np.repeat(chosen, each)
+        return self.triangles[rows], self.flux[rows]
+
+    def parts_of(self, chosen: np.ndarray, n: int) -> np.ndarray:
+        """(n,) float64, fraction of the light of each block or cell in its pairs in a mask (p,)."""
+        return np.bincount(self.names[chosen, 0], self.parts[chosen, 0], n)
 
 
 class Sheets(NamedTuple):
@@ -162,6 +191,7 @@ class Sheets(NamedTuple):
         optical length in metres, pixel coordinates of the projector.
     normal : (n, 3) float32, geometric normals.
     triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
+    direct : (t,) float64, W/m2, irradiance that the source would make there on a surface that faces it.
     shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
     lobe : (t,) uint32, number of the point of the narrow lobes that the light met, from 1 on; 0 if it met none.
     cut : ratio of the light that was lost in chains that are too long to all light.
@@ -177,6 +207,7 @@ class Sheets(NamedTuple):
     normal: np.ndarray
     triangles: np.ndarray
     flux: np.ndarray
+    direct: np.ndarray
     shape: np.ndarray
     key: np.ndarray
     lobe: np.ndarray
@@ -201,20 +232,41 @@ def trace_sheets(
     report : called after each kernel launch.
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
-    rng = np.random.default_rng(seed)
-    tracing = _Tracing(traced, pixel_rad, seed, report)
-    if not traced.projector.has_lens:
-        return joined([tracing.sheets(power_w, rng, None)])
-    made = [tracing.sheets(power_w * part, rng, p) for part, p in zip(LENS_WEIGHTS, _lens_points(), strict=True)]
-    # Chains through different points of the lens are different chains
-    return joined([one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(made)])
+    source = ProjectorSource(traced.projector, power_w, CAMERA_CELL * pixel_rad, pixel_rad)
+    points = None
+    if has_throwers(traced.scene):
+        cells = CellGrid.of(source.width, source.height, 1.0)
+        rays_of = lambda a, b: source.rays(cells.probes(a, b))[0]  # noqa: E731
+        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, lobes=True)
+        points = lobe_points(meets.mean() * source.width * source.height, seed)
+    tree = SpecularTree(traced, Launches(), points)
+    return sheets_of(tree, source, source.at, np.random.default_rng(seed), report)
 
 
-def _lens_points() -> np.ndarray:
-    """(7, 2) float64, see `LENS_WEIGHTS`, as the places in the unit square that are mapped to them."""
-    angle = np.pi / 3 * np.arange(6)
-    x, y = (mi.Float(np.append(0, LENS_RADIUS * f(angle)).astype(np.float32)) for f in (np.cos, np.sin))
-    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(x, y)).numpy().T.astype(np.float64)
+def sheets_of(
+    tree: SpecularTree,
+    source: DeltaSource,
+    projector_at: np.ndarray,
+    rng: np.random.Generator,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """The light of a source through glass and off mirrors, on the surfaces where it lands; None if there is none.
+
+    Parameters
+    ----------
+    tree : SpecularTree of the scene.
+    projector_at : (3,) float64, metres, world, the place from which distances count, see `MAX_SAG`.
+    rng : decides about photons.
+    """
+    tracing = _Tracing(tree, source, projector_at, report)
+    lenses = [None] if source.lens is None else list(source.lens)
+    made = [tracing.sheets(part, rng, lens) for part, lens in zip(source.lens_weights, lenses, strict=True)]
+    return joined(apart(made))
+
+
+def apart(sheets: Sequence[Sheets]) -> list[Sheets]:
+    """Sheets whose keys tell them apart: chains from different places are different chains."""
+    return [one._replace(key=one.key + np.uint32(i * HASH_STEP & 0xFFFFFFFF)) for i, one in enumerate(sheets)]
 
 
 def joined(sheets: Sequence[Sheets]) -> Sheets | None:
@@ -266,38 +318,51 @@ class _Points:
 
 
 class _Tracing:
-    """Traces sheets of a projector.
+    """Traces sheets of a source.
 
     Parameters
     ----------
-    traced, pixel_rad, seed, report : as for `trace_sheets`.
+    tree, source, projector_at, report : as for `sheets_of`.
     """
 
-    def __init__(self, traced: TracedScene, pixel_rad: float, seed: int, report: Callable[[], None]) -> None:
-        assert isinstance(traced.projector, Device)
-        self.device, self.report = traced.projector, report
-        width, height = (int(n[0]) for n in self.device.size)
-        self.angle = 1 / float(np.sqrt(self.device.f.x[0] * self.device.f.y[0]))
-        levels = int(np.log2(0.5 * BLOCK_PX / max(CAMERA_CELL * pixel_rad / self.angle, 1)))
-        self.levels = 0 if self.device.has_lens else min(max(levels, 0), MAX_LEVELS)
-        self.at = np.array([float(c[0]) for c in self.device.centre])
-        self.size_px = np.array([width, height])
-        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in (width, height))
+    def __init__(
+        self, tree: SpecularTree, source: DeltaSource, projector_at: np.ndarray, report: Callable[[], None]
+    ) -> None:
+        self.tree, self.source, self.at, self.report = tree, source, projector_at, report
+        self.is_glass = mi.Bool(table_of(tree.traced.scene, list(map(is_specular, tree.traced.scene.shapes()))))
+        # All lengths here are in parts of pixels, see `DeltaSource.fineness`
+        largest, self.fineness = 0.5 * BLOCK_PX, source.fineness
+        self.finest_px = float(np.clip(source.finest_px * self.fineness, 1, largest))
+        self.levels = min(int(np.log2(largest / self.finest_px)), MAX_LEVELS)
+        self.between_px = 1.0 if source.lens is not None else self.finest_px  # between rays that look for thin things
+        self.size_px = np.array([source.width, source.height]) * self.fineness
+        pixel = source.pixel_m / self.fineness, source.pixel_rad / self.fineness
+        self.rule = Rule(*pixel, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
+        self.blocks = tuple(int(np.ceil(n / BLOCK_PX)) for n in self.size_px)
         self.coarsest = 1 << self.levels
-        self.step_px = np.array([width, height]) / (2 * self.coarsest * np.array(self.blocks))
+        self.step_px = self.size_px / (2 * self.coarsest * np.array(self.blocks))
         self.columns = 2 * self.coarsest * self.blocks[0] + 1
-        cells = CellGrid.of(self.device)
-        probes = cells.columns * cells.rows, lambda a, b: self.device.centre_ray(cells.probes(a, b))
-        meets, _ = meets_delta(traced.scene, *probes, sends_on)
-        lobe_pixels = meets_delta(traced.scene, *probes, is_thrower)[0].mean() if has_throwers(traced.scene) else 0.0
-        self.tree = SpecularTree(traced, Launches(), seed, lobe_pixels * self.device.pixels)
-        self.delta = _Delta(
-            maximum_filter(meets.reshape(cells.rows, cells.columns), 3), 2 * self.coarsest * np.array(self.blocks)
+        cells = CellGrid.of(source.width, source.height, self.fineness)
+        meets, exists = meets_delta(
+            tree.traced.scene,
+            cells.columns * cells.rows,
+            lambda a, b: source.rays(cells.probes(a, b))[0],
+            source.shines_through_holes,
         )
+        if tree.has_lobes:
+            meets |= meets_delta(
+                tree.traced.scene,
+                cells.columns * cells.rows,
+                lambda a, b: source.rays(cells.probes(a, b))[0],
+                source.shines_through_holes,
+                lobes=True,
+            )[0]
+        meets = (meets & exists).reshape(cells.rows, cells.columns)
+        self.delta = _Delta(meets, 2 * self.coarsest * np.array(self.blocks))
 
-    def sheets(self, power_w: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
-        """Sheets of the light through a point of the lens, uniform coordinates in the unit square (2,); None: its
-        centre."""
+    def sheets(self, weight: float, rng: np.random.Generator, lens: np.ndarray | None) -> Sheets:
+        """Sheets of a fraction of the light through a point of the lens, uniform coordinates in the unit square (2,);
+        None: its centre."""
         points = _Points(self.columns, self.coarsest)
         x, y = (
             c.ravel().astype(np.int64) for c in np.meshgrid(*(2 * self.coarsest * np.arange(n) for n in self.blocks))
@@ -306,8 +371,7 @@ class _Tracing:
         near = self.delta.within(x, y, 2 * step)
         x, y = x[near], y[near]
         made, left = [], []
-        rule = Rule(self.angle, self.at, MAX_SAG, TOLERANCE_PX, FAINT, SIGNIFICANT)
-        watts = power_w / self.device.pixels
+        watts = weight * self.source.watts / self.fineness**2
         pixels = np.sqrt(self.step_px.prod())
         landings = _no_landings()
         while step and len(x):
@@ -315,18 +379,24 @@ class _Tracing:
             new = points.new(blocks)
             lattice, landings = points.add(new, *self._follow(self._pixels(new), lens, FEWEST))
             chains = Chains(*(getattr(landings, name) for name in Chains._fields))
-            meets = self.delta.within(x, y, 2 * step)
-            triangles, flux, divides, taken, used = smooth_chains(blocks, lattice, chains, rule, meets, taken, used)
-            made.append((triangles, flux))
-            divides &= step > 1
+            *found, rest, is_dark = smooth_chains(blocks, lattice, chains, self.rule, taken)
+            pairs = Pairs(*found)
+            is_clear = self._are_clear(pairs, chains, step * pixels, self.delta.fills(x, y, 2 * step))
+            rest += pairs.parts_of(~is_clear, len(rest))
+            taken, used = with_names(pairs.names[is_clear], x, y, step, self.columns, taken, used)
+            made.append(pairs.triangles_of(is_clear))
+            # A surface that lies between the points is as good as a chain that is not whole
+            divides = ((rest > SIGNIFICANT) | (is_dark & self.delta.within(x, y, 2 * step))) & (step > 1)
             whole = Blocks(x[~divides], y[~divides], *blocks[2:])
             cells = np.column_stack([np.add.outer(c, step * offset).ravel() for c, offset in (
                 (whole.x, np.array([0, 1, 0, 1])), (whole.y, np.array([0, 0, 1, 1])))])  # fmt: skip
-            meets = self.delta.within(cells[:, 0], cells[:, 1], step)
-            triangles, flux, rest, taken, used = cells_of(
-                whole, lattice, chains, rule, points.dropped, meets, taken, used
-            )
-            made.append((triangles, flux))
+            *found, rest, is_dark = cells_of(whole, lattice, chains, self.rule, points.dropped, taken)
+            pairs, (cx, cy) = Pairs(*found), cells.T.copy()
+            is_clear = self._are_clear(pairs, chains, step * pixels, self.delta.fills(cx, cy, step))
+            rest += pairs.parts_of(~is_clear, len(rest))
+            rest[is_dark & self.delta.within(cx, cy, step)] = 1.0
+            taken, used = with_names(pairs.names[is_clear], cx, cy, -step, self.columns, taken, used)
+            made.append(pairs.triangles_of(is_clear))
             left.append(np.column_stack([cells, np.full(len(cells), step), rest])[rest > 0])
             x, y, step = x[divides], y[divides], step // 2
             x, y = (
@@ -338,9 +408,45 @@ class _Tracing:
         triangles, flux = (np.concatenate(c) for c in zip(*made, strict=True))
         of_grid = _sheets(landings, self._pixels(points.numbers)[landings.point], triangles, watts * flux[:, 0], 0.0)
         both = joined([of_grid, self._photons(np.concatenate(left), taken, watts, rng, lens)])
-        if both is None:
-            return of_grid
-        return both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        every = of_grid if both is None else both._replace(in_triangles=float(of_grid.flux.sum() / both.flux.sum()))
+        direct = self.source.direct(every.position[every.triangles[:, 0]])
+        return every._replace(
+            u=every.u / np.float32(self.fineness), v=every.v / np.float32(self.fineness), direct=direct
+        )
+
+    def _are_clear(self, pairs: Pairs, chains: Chains, cell_px: float, fills: np.ndarray) -> np.ndarray:
+        """(p,) bool, whether all light between the points of pairs takes their way, as far as rays between them tell.
+
+        What hides the glass from the projector, what stands before the receiver, and holes in the receiver may lie
+        between the points. Faint light is taken as it is.
+
+        Parameters
+        ----------
+        cell_px : edge of a cell, pixels. fills : (n,) bool, whether all rays through a block or cell meet a delta
+            surface first.
+        """
+        is_clear = pairs.names[:, 2] > 0
+        looks = ~is_clear & fills[pairs.names[:, 0]]
+        if not looks.any():
+            return is_clear
+        side = int(np.ceil(cell_px / self.between_px))
+        triangles, _ = pairs.triangles_of(looks)
+        rays = last_ways(triangles, chains, self.rule, side, NEAREST, FLAT)
+        lands, shapes = np.empty(len(rays), bool), np.repeat(chains.shape[triangles[::2, 0]], side * side)
+        for begin in range(0, len(rays), MAX_AT_ONCE):
+            some = slice(begin, begin + MAX_AT_ONCE)
+            x, y, z, *direction, way, most = (mi.Float(aligned(c, np.float32)) for c in rays[some].T)
+            ray, here = (
+                mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(*direction)),
+                mi.UInt32(aligned(shapes[some], np.uint32)),
+            )
+            met = self.tree.traced.scene.ray_intersect_preliminary(ray, coherent=False)
+            is_here = (number_of(met.shape) == here) & (dr.abs(met.t - way) < most)
+            # Glass on the way is that which the light leaves: the ray starts inside it where it is curved
+            is_glass = dr.gather(mi.Bool, self.is_glass, number_of(met.shape), met.is_valid())
+            lands[some] = (met.is_valid() & (is_here | is_glass)).numpy()
+        is_clear[looks] = lands.reshape(looks.sum(), -1).all(axis=1)
+        return is_clear
 
     def _pixels(self, number: np.ndarray) -> np.ndarray:
         """(n, 2) float64, pixel coordinates of lattice points.
@@ -381,8 +487,11 @@ class _Tracing:
         corners, edges = cells[:, :2].astype(np.int64), cells[:, 2].astype(np.int64)
         which = sides_of_photons(corners, edges, lists, self.columns, self.coarsest, chains, taken)
         power = watts * size.prod(axis=1) / chance
-        made = _parallelograms(found, which, size, place, power, self.angle, self.at, self._lie_on)
-        return made._replace(cut=float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0)
+        made = _parallelograms(found, which, size, place, power, self.rule, self._lie_on)
+        # Nothing outside the image may reach a pattern
+        u, v = (np.clip(c, 0, np.float32(n)) for c, n in zip((made.u, made.v), self.size_px, strict=True))
+        cut = float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0
+        return made._replace(u=u, v=v, cut=cut)
 
     def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
         """(n,) bool, whether points (n, 3), metres, lie on shapes of these numbers (n,), as far as one looks along
@@ -402,13 +511,13 @@ class _Tracing:
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
         found, lost = [_no_landings()], [np.empty(0)]
-        at_once = MAX_AT_ONCE // (self.tree.points if self.tree.has_lobes else 1)
+        at_once = MAX_AT_ONCE // self.tree.points
         for begin in range(0, len(pixels), at_once):
             some = slice(begin, begin + at_once)
-            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in pixels[some].T))
-            rays = self.device.sample_ray(place, None if lens is None else mi.Point2f(*map(float, lens)))
+            place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in (pixels[some] / self.fineness).T))
+            on_lens = None if lens is None else mi.Point2f(*map(float, lens))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
-            landings, dropped = self.tree.follow(rays, fewest, random)
+            landings, dropped = self.tree.follow(self.source, place, on_lens, fewest, random)
             self.report()
             found.append(landings._replace(point=landings.point + np.uint32(begin)))
             lost.append(dropped)
@@ -418,7 +527,7 @@ class _Tracing:
 def _no_landings() -> Landings:
     """No landing at all."""
     whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    return Landings(whole, whole, whole, whole, real, real, real, vector, vector, vector)
+    return Landings(whole, whole, whole, real, real, real, real, vector, vector, vector, whole)
 
 
 def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
@@ -428,7 +537,8 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     of = triangles[:, 0]
     slowness = landings.ior[:, None] * landings.direction
     vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
-    return Sheets(*vertices, triangles, flux, landings.shape[of], landings.key[of], landings.lobe[of], cut, 0.0)
+    untold = np.full(len(triangles), np.nan)
+    return Sheets(*vertices, triangles, flux, untold, landings.shape[of], landings.key[of], landings.lobe[of], cut, 0.0)
 
 
 def _parallelograms(
@@ -437,8 +547,7 @@ def _parallelograms(
     size: np.ndarray,
     place: np.ndarray,
     power: np.ndarray,
-    angle: float,
-    projector_at: np.ndarray,
+    rule: Rule,
     lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
 ) -> Sheets:
     """Sheets of photons, two triangles each.
@@ -447,7 +556,7 @@ def _parallelograms(
     ----------
     found : Landings of the three points of each photon. which : (m, 3) int64, see `sides_of_photons`.
     size, place : (n, 2) float64, pixels, sizes of the photons' cells and places of the photons.
-    power : (n,) float64, watts, power that a photon stands for. angle : radians, of a pixel. projector_at : (3,).
+    power : (n,) float64, watts, power that a photon stands for. rule : Rule.
     lie_on : function that says whether points with normals lie on shapes.
     """
     this = which[:, 0]
@@ -456,7 +565,8 @@ def _parallelograms(
     normal = found.normal[this].astype(np.float64)
     # Where no chain of the same name lies beside a photon, its light spreads as without glass
     across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    across *= (angle * found.length[this] / np.linalg.norm(across, axis=1))[:, None]
+    spread = rule.pixel_m + rule.pixel_rad * found.length[this]
+    across *= (spread / np.linalg.norm(across, axis=1))[:, None]
     plain = np.stack([across, np.cross(normal, across)], axis=1)
     known = np.all(which[:, 1:] >= 0, axis=1, keepdims=True)
     sides = (
@@ -466,7 +576,7 @@ def _parallelograms(
     longest = MAX_SIDE * found.length[this, None]
     turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
     length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
-    sag = MAX_SAG * np.linalg.norm(centre - projector_at, axis=1)[:, None]
+    sag = rule.sag * np.linalg.norm(centre - rule.projector_at, axis=1)[:, None]
     flat = np.sqrt(4 * sag / np.maximum(np.where(known, turn, 0) * length, MIN_SIDE_M))  # half for each side
     shrinks = np.minimum(np.minimum(longest / length, flat), 1)
     sides *= shrinks[..., None]
@@ -505,14 +615,24 @@ class _Delta:
 
     def __init__(self, meets: np.ndarray, lattice: np.ndarray) -> None:
         rows, columns = meets.shape
-        self.sums = np.zeros((rows + 1, columns + 1), np.int64)
-        self.sums[1:, 1:] = meets.cumsum(0).cumsum(1)
+        self.near, self.all = (np.zeros((rows + 1, columns + 1), np.int64) for _ in range(2))
+        self.near[1:, 1:] = maximum_filter(meets, 3).cumsum(0, np.int64).cumsum(1)
+        self.all[1:, 1:] = meets.cumsum(0, np.int64).cumsum(1)
         self.scale = np.array([columns, rows]) / lattice
 
     def within(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:
-        """(n,) bool, whether some ray through squares of the lattice meets one."""
-        rows, columns = self.sums.shape
+        """(n,) bool, whether some ray through squares of the lattice, or right beside them, meets one."""
+        return self._number(self.near, x, y, edge)[0] > 0
+
+    def fills(self, x: np.ndarray, y: np.ndarray, edge: int) -> np.ndarray:
+        """(n,) bool, whether all rays through squares of the lattice meet one."""
+        number, cells = self._number(self.all, x, y, edge)
+        return number == cells
+
+    def _number(self, sums: np.ndarray, x: np.ndarray, y: np.ndarray, edge: int) -> tuple[np.ndarray, np.ndarray]:
+        """Sum over the cells of the image that squares of the lattice touch, and number of these cells; (n,) int64."""
+        rows, columns = sums.shape
         x0, y0 = (np.floor(c * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
         x1, y1 = (np.ceil((c + edge) * s).astype(np.int64) for c, s in ((x, self.scale[0]), (y, self.scale[1])))
         x1, y1 = np.minimum(np.maximum(x1, x0 + 1), columns - 1), np.minimum(np.maximum(y1, y0 + 1), rows - 1)
-        return self.sums[y1, x1] - self.sums[y0, x1] - self.sums[y1, x0] + self.sums[y0, x0] > 0
+        return sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0], (x1 - x0) * (y1 - y0)

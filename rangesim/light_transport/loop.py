@@ -153,7 +153,7 @@ class SampleAllocation:
             samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
             total=twice(self.total),
             irradiance=self.irradiance,
-            first=self.first + 2 * half,
+            first=(self.first if isinstance(self.first, int) else twice(self.first)) + 2 * half,
             stride=2 * self.stride,
             part=2 * self.part + half,
         )
@@ -253,10 +253,12 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the triangles of light (None: there are none)."""
+    """Everything that the lanes read: the scene with its devices, and the triangles of light, of the projector and of
+    lamps of the scene (None: there are none)."""
 
     traced: TracedScene
     sheets: SheetScene | None = None
+    of_lamps: SheetScene | None = None
 
 
 def trace(
@@ -434,7 +436,7 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, sheets = view
+    traced, sheets, of_lamps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
@@ -443,6 +445,7 @@ def walk(
     sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
+    nothing = Accumulators((), 1)  # the light of lamps is in no channel
     active = (state.sample < lanes.samples) & (left > 0)
 
     while active:
@@ -552,7 +555,7 @@ def walk(
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
             via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
             is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
-        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
+        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside, cutouts)
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
             comes_back = is_vertex & is_own & (path.depth == 1) & (path.chain > 0)
@@ -611,7 +614,7 @@ def walk(
         # ---- Caustics: light that reached this point through glass or off mirrors --------------------
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            state.channels, light = caustic_light(
+            state.channels, sharp, smooth = caustic_light(
                 sheets,
                 accumulators,
                 state.channels,
@@ -623,9 +626,9 @@ def walk(
                 lanes.place,
                 gathers & ~scatters,
             )
-            radiance.caustic += dr.select(is_later, 0, light)
-            radiance.smooth_caustic += dr.select(is_later, light, 0)
-            tally.indirect += dr.select(is_later, light, 0)
+            radiance.caustic += sharp
+            radiance.smooth_caustic += smooth
+            tally.indirect += dr.select(is_later, smooth, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -642,6 +645,21 @@ def walk(
                         traced, bsdf, si, ray.d, path.ray_state, scatters, xi, is_vertex
                     )
                 radiance.ambient += path.throughput * light
+            if dr.hint(of_lamps is not None, mode="scalar"):
+                vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, mi.Bool(False))
+                _, sharp, smooth = caustic_light(
+                    of_lamps,
+                    nothing,
+                    [],
+                    vertex,
+                    lanes.turn(number),
+                    lanes.lobe_turn(number),
+                    lanes.pick(number),
+                    is_later,
+                    lanes.place,
+                    is_vertex & ~scatters,
+                )
+                radiance.ambient += sharp + smooth
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)

@@ -204,7 +204,7 @@ class Estimate:
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
-        """Take more samples of some pixels. All of these pixels must have had the same number of samples.
+        """Take more samples of some pixels.
 
         Parameters
         ----------
@@ -212,12 +212,12 @@ class Estimate:
         samples : (n,) int, number of samples to be taken of each.
         report : called with the fraction done after each launch.
         """
-        first = int(sum(taken.ravel()[pixels[0]] for taken in self.samples))
+        before = np.stack([taken.ravel()[pixels] for taken in self.samples]).sum(axis=0, dtype=np.uint32)
         samples = samples.astype(np.uint32)
         total, done = int(samples.sum(dtype=np.int64)), 0
         for begin, end in self._tiles(len(pixels)):
-            some, of_tile = pixels[begin:end], samples[begin:end]
-            allocation = SampleAllocation(some, of_tile, of_tile + np.uint32(first), self.irradiance, first)
+            some, of_tile, first = pixels[begin:end], samples[begin:end], before[begin:end]
+            allocation = SampleAllocation(some, of_tile, of_tile + first, self.irradiance, first)
             allocation = replace(allocation, part=self.rounds)
             if len(self.halves) == 2:
                 allocation = allocation.in_halves()
@@ -233,6 +233,14 @@ class Estimate:
                 self.tally = of_image.added(traced.tally[:, columns], self.tally)
             done += now
         self.rounds += 1
+
+    def caustics_and_light(self) -> tuple[np.ndarray, np.ndarray]:
+        """Draw of the error of the caustics at first vertices, and mean of all light of the projector, (h, w) each,
+        W/m2/sr. It needs halves."""
+        sums = [half.radiance for half in self.halves if half.radiance is not None]
+        mean, error = [np.zeros_like(x) for x in sums]
+        Halves(self.samples).mean_and_error(sums, [mean, error])
+        return Radiance(*error).caustic, projector_light(Radiance(*mean))
 
     def mean_tally(self) -> np.ndarray:
         """(6, h, w) float32, means over samples, in the order of the fields of `Tally`."""

@@ -7,7 +7,6 @@ surface by a distance of its own.
 
 Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side. A
 sample of a pixel looks into one group, whose light counts for all. The samples of a pixel look into all groups in turn.
-Light of narrow lobes is dealt out in the same way, by the points of the lobes.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.caustic_kernels import crowd_of, irradiance_of, lifted
+from rangesim.light_transport.caustic_kernels import irradiance_of, lifted, lit_directions
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.specular_tree import LOBE_GROUPS
@@ -40,24 +39,21 @@ the lit part of the scene, where they are small."""
 MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
-PERIOD = 16
-"""Largest number of samples after which a half of a pixel's samples has looked into all groups of faint triangles. With
-a longer period, faint light would be noisy in passes of few samples."""
-EVERY = 4
-"""Largest number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
+GROUPS = 4
+"""Number of groups of faint triangles; a power of 2. With more groups, samples would find fewer of them at little cost,
+but faint light would be noisier."""
+EVERY = 8
+"""Number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
 longer."""
-FAINT_LOBES = 0.5
-"""Fraction of the light of narrow lobes that may be bright while samples look for it in turn, so that this light is not
-noisy where there is much of it."""
-CROWD = 2.0
-"""Number of faint triangles over a point from which they are dealt out to groups, because every sample looks for
-fewer of them at little cost."""
-CUBES = 64
-"""Number of cubes along the lit part of the scene, in which faint triangles are counted. With fewer cubes, the count of
-a small spot would be that of its surroundings."""
 FAINTEST = 1e-3
 """Ratio of the irradiance to direct light below which faint triangles are drawn by lot, anew for each seed. There are
 many of them, and together they bring a few thousandths of the light."""
+DIRECTIONS = 128
+"""Number of cubes along the cube of unit vectors, in which directions with light are marked: as fine as triangles, and
+so few that the table fits into a cache."""
+REACH = 2 * MARGIN * (0.5 * LIFT + MAX_SAG)
+"""Radians by which the direction of a point may differ from that of a triangle that lights it: twice the distance over
+which rays look, so that rounding does not matter."""
 SPACING = 1.5
 """Distance between groups of faint triangles, as a multiple of the size of the lit part of the scene, so that groups do
 not touch."""
@@ -115,49 +111,44 @@ class SheetScene:
     Parameters
     ----------
     sheets : Sheets, at least one triangle.
-    projector_at : (3,) float, metres, world. irradiance : W/m2, of the projector's direct light at 1 m.
-    samples : int, smallest number of samples of a pixel, which bounds the number of groups.
+    projector_at : (3,) float, metres, world.
     seed : int, decides which of the faintest triangles are kept.
+    blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
-    def __init__(
-        self, sheets: Sheets, projector_at: np.ndarray, irradiance: float, samples: int, seed: int = 0
-    ) -> None:
-        period = 1 << int(np.log2(max(1, min(samples // 2, PERIOD))))  # in each half of the samples
-        every = min(period, EVERY)
-        groups = period // every
+    def __init__(self, sheets: Sheets, projector_at: np.ndarray, seed: int = 0, blur_px: float | None = None) -> None:
+        self.blur_px = None if blur_px is None else mi.Float(blur_px)
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.linalg.norm(first - projector_at, axis=1)
-            level = sheets.flux / area * distance**2 / irradiance
+            level = sheets.flux / area / sheets.direct
+            # A faint triangle lies in more groups the brighter it is, so that each one found brings about as much
+            copies = np.clip(2 ** np.ceil(np.log2(GROUPS * level / FAINT)), 1, GROUPS)
+        # Light of a narrow lobe is faint where that of all its points together is
+        is_faint = level * np.where(sheets.lobe > 0, max(sheets.lobe.max(), 1), 1) < FAINT
+        copies = np.where(is_faint, copies, 0).astype(np.int64)
+        group_of_lobe = 1 + GROUPS + (sheets.lobe.astype(np.int64) - 1) % LOBE_GROUPS
+        of_lobe = np.where((sheets.lobe > 0) & ~is_faint, group_of_lobe, 0)
+        self.has_lobes = bool(of_lobe.any())
+        # What samples look for first where there is bright light, as `which` of `ray`
+        self.first = 2 if self.has_lobes and (copies[of_lobe == 0] > 0).all() else 0
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
-        # Faint light of lobes is looked for in some samples alone, unless some of it is bright
-        self.has_lobes = bool(sheets.lobe.any())
-        is_bright = level * sheets.lobe.max() >= FAINT
-        bright, of_lobes = (float(sheets.flux[(sheets.lobe > 0) & which].sum()) for which in (is_bright, np.True_))
-        self.lobes_in_turn = bright <= FAINT_LOBES * of_lobes
-        self.first = 2 if sheets.lobe.all() else 0  # through what samples look first, as `which` of `ray`
-        places_needed = 1 + groups + self.has_lobes * LOBE_GROUPS
-        across = math.isqrt(places_needed - 1) + 1  # all of them lie in a square
+        copied = 1 + GROUPS + self.has_lobes * LOBE_GROUPS
+        across = math.isqrt(copied - 1) + 1  # all of them lie in a square
         places = [[g % across, g // across] for g in range(across**2)]
         places = sorted(places, key=lambda place: np.hypot(*(np.array(place) - across // 2)))
-        offsets = (np.array(places[:places_needed]) - across // 2) * (SPACING * size)  # bright ones in the middle
+        offsets = (np.array(places[:copied]) - across // 2) * (SPACING * size)  # bright ones in the middle
         image = np.column_stack([sheets.u, sheets.v]).view(np.uint64)[:, 0]
         columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key, image)
         flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
-        is_faint = (level < FAINT) & (sheets.lobe == 0)
-        weak = np.flatnonzero(is_faint)
-        crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
-        is_faint[weak[crowd < CROWD]] = False
-        fixed = np.where(sheets.lobe > 0, 1 + groups + (sheets.lobe.astype(np.int64) - 1) % LOBE_GROUPS, 0)
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
-        numbers = groups, every, LOBE_GROUPS * (every if self.lobes_in_turn else 1)
-        corners, names, terms = lifted(
-            columns, scale, is_faint, fixed, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
+        numbers = GROUPS, EVERY, LOBE_GROUPS
+        corners, names, terms, faint = lifted(
+            columns, scale, copies, of_lobe, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
@@ -173,25 +164,24 @@ class SheetScene:
         )
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.terms, self.offsets = mi.Float(aligned(terms, np.float32)), mi.Float(aligned(offsets, np.float32))
-        self.groups, self.every = dr.opaque(mi.UInt32, groups), dr.opaque(mi.UInt32, every)
-        half_size = 0.5 * (high - low) + MARGIN * (0.5 * LIFT + MAX_SAG) * distance.max()
-        self.projector_at, self.middle, self.half_size = (
-            mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle, half_size)
+        self.projector_at, self.middle = (
+            mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle)
         )
-        is_lit = np.zeros(int(sheets.shape.max()) + 1, np.bool_)
-        is_lit[names[:, 3]] = True
-        self.is_lit, self.shapes = mi.Bool(is_lit), dr.opaque(mi.UInt32, len(is_lit))
+        from_projector = sheets.position - np.asarray(projector_at, np.float32)
+        lit = lit_directions(from_projector, names[:, :3], faint, DIRECTIONS, REACH)
+        self.lit = mi.UInt32(aligned(lit, np.uint32))
 
-    def may_light(self, point: mi.Point3f, shape: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether any triangle lies on a shape, and the point is in the lit part of the scene, beyond which its copies
-        begin."""
-        inside = dr.abs(mi.Vector3f(point) - self.middle) < self.half_size
-        known = active & dr.all(inside) & (shape < self.shapes)
-        return known & dr.gather(mi.Bool, self.is_lit, shape, known)
+    def may_light(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Whether bright triangles, and whether faint ones, lie in about the direction of a point."""
+        direction = dr.normalize(mi.Vector3f(point) - self.projector_at)
+        x, y, z = (dr.minimum(mi.UInt32((d + 1) * (0.5 * DIRECTIONS)), DIRECTIONS - 1) for d in direction)
+        cube = (x * DIRECTIONS + y) * DIRECTIONS + z
+        bits = dr.gather(mi.UInt32, self.lit, cube >> 4, active) >> ((cube & 15) << 1)
+        return active & ((bits & 1) != 0), active & ((bits & 2) != 0)
 
     def is_turn(self, turn: mi.UInt32, which: mi.UInt32) -> mi.Bool:
         """True where it is this turn; each turn comes once in `every` samples."""
-        return turn % self.every == which % self.every
+        return turn % EVERY == which % EVERY
 
     def ray(
         self,
@@ -211,9 +201,9 @@ class SheetScene:
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
         above = MARGIN * (0.5 * LIFT + MAX_SAG) * distance
-        group = dr.select(which == 0, 0, turn // self.every % self.groups + 1)
+        group = dr.select(which == 0, 0, turn // EVERY % GROUPS + 1)
         if self.has_lobes:
-            group = dr.select(which == 2, 1 + self.groups + lobe_turn % LOBE_GROUPS, group)
+            group = dr.select(which == 2, 1 + GROUPS + lobe_turn % LOBE_GROUPS, group)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
         place = mi.Point3f(point) - self.middle + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))

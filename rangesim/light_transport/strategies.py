@@ -2,8 +2,8 @@
 """The strategies that bring light from the projector to the camera, and which of them owns a light path.
 
 A vertex of a light path is a surface point where light scatters into many directions, or a scattering event inside a
-medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats,
-holes), which send it on in single directions.
+medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats),
+which send it on in single directions. Holes send it on as if nothing were there, so a segment may go through them.
 
 Metal and glass of a small roughness are in between: they scatter light into narrow lobes, which light paths find by
 chance only where they come from there. Such lobes count as vertices for a camera path that comes to them from the

@@ -25,7 +25,7 @@ class TransportSettings:
         samples and then up to 64, until the renderer's noise in the readings of its instruments is small compared with
         the noise of their detectors. "auto" is AdaptiveSampling for the sensors of the pass with their default
         detectors. For bare responses, and without `sampling_error`, "auto" is 16 samples where pixels share their
-        indirect light, and 64 elsewhere.
+        indirect light, and 64 elsewhere. With `sampling_error`, pixels with uneven caustics get more, up to 256.
     max_depth : int >= 1, largest number of segments of a path between surfaces that scatter it, including the last
         segment to the light. 2 means direct light only, as in Mitsuba. Delta interactions (glass, mirrors, thin panes,
         coats, holes) do not count. They have a limit of their own, `rangesim.light_transport.specular_chain.MAX_CHAIN`

@@ -87,17 +87,12 @@ def is_near_specular(bsdf: Any) -> bool:
         return False
     parts = mi.traverse(bsdf).hierarchy
     names = {part.class_name() for part in parts if isinstance(part, mi.BSDF)}
-    alphas = _alphas(_numbers(bsdf))
+    alphas = np.array(_alphas(_numbers(bsdf)), np.float32)
     return (
         names <= set(NEAR_SPECULAR_BSDFS)
-        and bool(alphas)
-        and bool(np.float32(max(alphas)) <= np.float32(MAX_NEAR_SPECULAR_ALPHA))
+        and len(alphas) > 0
+        and bool((alphas <= np.float32(MAX_NEAR_SPECULAR_ALPHA)).all())
     )
-
-
-def is_closed_mask(bsdf: Any) -> bool:
-    """Whether the surface is a `mask` with opacity 1 everywhere, around a BSDF without thin glass."""
-    return bool(bsdf.class_name() == "MaskBSDF" and not _has_thin_glass(bsdf) and _numbers(bsdf).get("opacity") == 1)
 
 
 def holes(bsdf: Any) -> int:
