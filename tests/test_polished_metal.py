@@ -81,6 +81,8 @@ def test_metal_becomes_a_mirror_as_its_roughness_vanishes() -> None:
     assert set(np.unique(metal.lobe)) == set(range(1, LOBE_POINTS + 1))
     centres = [np.average(s.position[s.triangles].mean(axis=1), axis=0, weights=s.flux) for s in (mirror, metal)]
     np.testing.assert_allclose(*centres, atol=1e-3)
+    lengths = [np.average(s.length[s.triangles].mean(axis=1), weights=s.flux) for s in (mirror, metal)]
+    assert lengths[0] == pytest.approx(lengths[1], abs=1e-3)
 
 
 @pytest.mark.parametrize(
