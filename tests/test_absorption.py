@@ -248,7 +248,6 @@ def over() -> Any:
 
 
 @pytest.mark.validation
-@pytest.mark.filterwarnings("ignore:.*point and spot emitters does not pass glass")
 @pytest.mark.parametrize(
     "kind",
     ["ball", "rough ball", "glass in water", "lamp in water", "milk in glass", "point lamp, milk and stone in water"],

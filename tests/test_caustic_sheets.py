@@ -144,6 +144,44 @@ def test_photons_do_not_hang_over_the_edges_of_a_receiver() -> None:
     assert sheets.flux[n:][hangs].sum() < 0.1 * sheets.flux[n:].sum()
 
 
+def test_the_order_of_the_shapes_changes_no_light() -> None:
+    """Light through a pane and light off it land on two walls, whose numbers in the scene differ in all ways."""
+    rig, small = rig_of(CAMERA, Intrinsics.from_fov(80, 60, 40)), wall(5.0, matte(), 0.01)
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    behind = {**wall(-1.0, matte()), "to_world": transform().translate([0, 0, -1]).scale([5, 5, 1])}
+    for between in range(8):
+        others = {f"{number}": small for number in range(between)}
+        scene = scene_of(pane=pane, wall=wall(1.0, matte()), **others, behind=behind)
+        assert thrown_w(scene, rig) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("at_m", [0.2, 0.8], ids=["before the pane", "behind it"])
+def test_thin_things_between_points_of_the_grid_take_their_light(at_m: float) -> None:
+    """A wire of two projector pixels takes two columns of the light, wherever it stands; points are four apart."""
+    rig, pixel_m = rig_of(CAMERA, PROJECTOR), at_m / PROJECTOR.fx
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    half, passed = 0.5 * 2 * pixel_m, []
+    for shift in range(4):
+        place = transform().translate([(10.3 + shift) * pixel_m, 0, at_m]).scale([half, 1, -1])
+        scene = scene_of(pane=pane, wall=wall(PLANE, matte()), wire={**wall(0, matte()), "to_world": place})
+        sheets = light_of(scene, rig)
+        on_wall = sheets.flux[np.isclose(sheets.position[sheets.triangles[:, 0], 2], PLANE)]
+        passed.append(on_wall.sum())
+    whole = light_of(scene_of(pane=pane, wall=wall(PLANE, matte())), rig).flux.sum()
+    taken = 1 - np.array(passed) / whole
+    assert np.abs(taken / (2 / PROJECTOR.width) - 1).max() < 0.1
+
+
+def test_no_light_comes_from_outside_the_image() -> None:
+    """Photons are as large as their cells, also at the border of the image; patterns have no pixels beyond it."""
+    ball = {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.1, "bsdf": GLASS}
+    rig = rig_of(CAMERA, Intrinsics.from_fov(320, 240, 30), projector_lens=Lens(4e-3, focus_m=0.8))
+    sheets = light_of(scene_of(ball=ball, wall=wall(PLANE, matte())), rig)
+    for place, size in ((sheets.u, 320), (sheets.v, 240)):
+        assert place.min() >= 0
+        assert place.max() <= size
+
+
 # ---- Receivers --------------------------------------------------------------------------------------
 
 
@@ -188,6 +226,20 @@ def test_layers_of_one_mesh_that_face_the_same_way_do_not_light_each_other(tmp_p
     layers = {"type": "ply", "filename": str(tmp_path / "layers.ply"), "face_normals": True, "bsdf": matte()}
     lit = lit_through_a_pane((0.3, 0.0, 0.6), (0.0, 0.0, 1.0), layers=layers).mean()
     assert lit_through_a_pane((0.05, 0.02, 1.0002), (0.05, 0.02, 1.0005), layers=layers).mean() < 0.1 * lit
+
+
+def test_a_cable_behind_a_pane_gets_its_light() -> None:
+    """It is two projector pixels wide and round, so its light is photons, which lie on tangent planes."""
+    cable = {"type": "cylinder", "p0": [3e-3, -0.3, 1.0], "p1": [3e-3, 0.3, 1.0], "radius": 2e-3, "bsdf": matte()}
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    rig = rig_of(Intrinsics.from_fov(16, 320, 0.5), PROJECTOR, (0, 0, 0), None, (0.1, 0, 0.3), (3e-3, 0, 1))
+    options: dict[str, Any] = {"spp": 16, "max_depth": 2, "glint": False, "indirect": "raw"}
+    free = transport(scene_of(cable=cable), rig, [], **options).energy.direct.sum()
+    behind = [
+        transport(scene_of(cable=cable, pane=pane), rig, [], seed=seed, **options).energy.caustic.sum()
+        for seed in range(3)
+    ]
+    assert np.mean(behind) / free == pytest.approx(0.923, rel=0.07)  # 0.78 where sides are no tangents
 
 
 def test_light_that_comes_by_several_ways_adds_up() -> None:

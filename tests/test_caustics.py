@@ -28,7 +28,7 @@ from delta_scenes import (
 from tiers import to_validate
 
 import rangesim
-from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
+from rangesim import AmcwToF, IdealToF, Intrinsics, Lens, Rig, Scene, StructuredLight, transport
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LightPath, TransientHistogram
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -245,20 +245,80 @@ def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
         assert np.abs(x / a - y / b).max() < 0.02
 
 
-def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -> None:
-    free = before_the_projector()
-    hole = {"type": "mask", "opacity": 0.0, "bsdf": matte()}
-    through = before_the_projector(hole=wall(0.2, hole, 0.15, x=0.3))
-    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(1, abs=0.01)
-    np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
+def test_light_that_lands_on_a_coat_stays_there_although_its_reflection_lands_elsewhere() -> None:
+    """A plastic wall behind a pane is as bright as in direct light, times the pane's transmittance."""
+    rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    behind = {**wall(0, matte()), "to_world": transform().translate([0, 0, -2]).scale([5, 5, 1])}
+    parts, options = {"wall": wall(PLANE, PLASTIC), "behind": behind}, {"spp": 16, "max_depth": 2, "glint": False}
+    free = transport(scene_of(**parts), rig, [], **options).energy.direct
+    pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
+    dimmed = transport(scene_of(**parts, pane=pane), rig, [], **options).energy.caustic
+    off = np.abs(dimmed / free / pane_transmittance(np.array(0.2)) - 1)
+    assert np.percentile(off, 95) < 0.01  # some pixels see what the pane throws back, in the coat
 
 
-@pytest.mark.parametrize("nested", [matte(), *to_validate(PLASTIC, MIRROR)], ids=lambda bsdf: str(bsdf["type"]))
-def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
+def test_light_through_a_pane_right_before_the_projector_counts_once() -> None:
+    """A protective window, at 1 mm from the lens for a wall at 5 m."""
+    pane, rig = wall(1e-3, {**GLASS, "type": "thindielectric"}, 2e-3), rig_of(CAMERA, PROJECTOR, camera_at=(0.3, 0, 0))
+    energy = transport(scene_of(wall=wall(5.0, matte()), pane=pane), rig, [], spp=4, max_depth=2, glint=False).energy
+    assert energy.caustic.any()
+    assert not energy.direct.any()
+
+
+@pytest.mark.parametrize(
+    ("opacity", "nested"),
+    [(0.0, matte()), (0.5, matte()), *to_validate((0.5, PLASTIC), (0.5, MIRROR))],
+    ids=lambda part: str(part["type"]) if isinstance(part, dict) else str(part),
+)
+def test_holes_pass_light_straight_and_without_noise(opacity: float, nested: dict[str, Any]) -> None:
+    """Light through a hole is direct light, in every pixel and in its projector coordinates."""
     free = before_the_projector()
-    veil = {"type": "mask", "opacity": 0.5, "bsdf": nested}
+    veil = {"type": "mask", "opacity": opacity, "bsdf": nested}
     through = before_the_projector(hole=wall(0.2, veil, 0.15, x=0.3))
-    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(through.energy.direct, (1 - opacity) * free.energy.direct, rtol=1e-5)
+    coordinates = [s.channels[ProjectorCoordinates()] for s in (through, free)]
+    np.testing.assert_allclose(coordinates[0], (1 - opacity) * coordinates[1], rtol=2e-3)
+    assert through.truth.projector_visible.all()
+
+
+def test_the_light_of_a_perforated_sheet_is_its_pattern() -> None:
+    """A checkerboard of holes of two projector pixels, whose open area no grid over the image could tell."""
+    cells, half, at = 240, 0.15, 0.2
+    pattern = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "to_uv": transform().scale([cells / 2] * 2 + [1])}
+    sheet = {"type": "mask", "opacity": pattern, "bsdf": matte()}
+    free, through = before_the_projector(), before_the_projector(sheet=wall(at, sheet, half, x=0.3))
+    ratio = through.energy.direct / free.energy.direct
+    within = np.random.default_rng(0).uniform(-0.5 / CAMERA.fx, 0.5 / CAMERA.fx, (4096, 1, 1, 2))
+    on_sheet = (points_on_the_plane(free.rig)[..., :2] + within - [0.3, 0.0]) * at + half
+    is_open = (np.floor(on_sheet * cells / (2 * half)).sum(axis=-1) % 2 == 1).mean(axis=0)
+    assert is_open.std() > 0.15
+    assert (ratio - is_open).std() < 0.04  # 64 samples a pixel
+    assert ratio.mean() == pytest.approx(0.5, abs=3e-3)
+    assert not through.energy.caustic.any()
+
+
+def test_a_picture_in_glass_is_thrown_as_sharply_as_the_projector_s_pixels() -> None:
+    """Fields of three pixels; points of the largest cells are four apart."""
+    cells, half, at, thin = 174, 0.15, 0.2, {**GLASS, "type": "thindielectric"}
+    pattern = {"type": "checkerboard", "color0": 0.2, "color1": 1.0, "to_uv": transform().scale([cells / 2] * 2 + [1])}
+    clear, stained = (
+        before_the_projector(pane=wall(at, bsdf, half, x=0.3)).energy.caustic
+        for bsdf in (thin, {**thin, "specular_transmittance": pattern})
+    )
+    within = np.random.default_rng(0).uniform(-0.5 / CAMERA.fx, 0.5 / CAMERA.fx, (4096, 1, 1, 2))
+    place = (points_on_the_plane(rig_of(CAMERA, PROJECTOR))[..., :2] + within - [0.3, 0.0]) * at + half
+    is_bright = (np.floor(place * cells / (2 * half)).sum(axis=-1) % 2 == 1).mean(axis=0)
+    ratio = stained / clear
+    assert ratio.mean() == pytest.approx(0.6, abs=0.01)
+    assert np.corrcoef(ratio.ravel(), is_bright.ravel())[0, 1] > 0.8  # its edges are a pixel wide
+
+
+def test_light_through_a_hole_and_a_pane_is_that_through_the_pane() -> None:
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 0.25, x=0.3)
+    hole = wall(0.2, {"type": "mask", "opacity": 0.0, "bsdf": matte()}, 0.15, x=0.3)
+    alone, both = before_the_projector(pane=pane), before_the_projector(pane=pane, hole=hole)
+    assert (both.energy.caustic / alone.energy.caustic).mean() == pytest.approx(1, abs=0.01)
+    assert not both.energy.direct.any()
 
 
 # ---- Shading normals --------------------------------------------------------------------------------
@@ -382,6 +442,28 @@ def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> N
     behind = fringe_contrast(*board_behind_a_pane(wall_z, pane=pane))
     assert behind == pytest.approx(alone, abs=0.005)
     assert behind == pytest.approx(free, abs=0.01)  # light reflected to and fro between pane and board takes 0.006
+
+
+def test_a_coarse_emitter_has_sharp_shadows_behind_a_pane() -> None:
+    """The pixels of a flood illuminator are only coordinates; here each is as wide as nine pixels of the camera."""
+    rig = rig_of(Intrinsics.from_fov(64, 48, 20), Intrinsics.from_fov(8, 6, 26), (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    parts = {"wall": wall(PLANE, matte()), "card": wall(0.7, matte(), 0.03, x=0.13)}
+    options: dict[str, Any] = {"spp": 16, "max_depth": 2, "glint": False, "indirect": "raw"}
+    free = transport(scene_of(**parts), rig, [], **options).energy.direct
+    pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
+    behind = transport(scene_of(**parts, pane=pane), rig, [], **options).energy.caustic
+    assert (free < 0.01 * free.max()).mean() > 0.05  # the shadow
+    assert (np.abs(behind / pane_transmittance(np.array(0.1)) - free) > 0.05 * free.max()).mean() < 0.03
+
+
+def test_fringes_in_focus_are_as_sharp_behind_a_pane_as_before_it() -> None:
+    """A projector with a lens shows each pixel over its whole width, also behind glass; docs/optics.md."""
+    lens, pane, contrast = Lens(1e-5, focus_m=PLANE), wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3), []
+    for parts in ({}, {"pane": pane}):
+        rig = rig_of(Intrinsics.from_fov(64, 8, 10), PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0), projector_lens=lens)
+        signals = transport(scene_of(wall=wall(PLANE, matte()), **parts), rig, [Fringes(0, 8.0)], spp=64, max_depth=2)
+        contrast.append((np.hypot(*signals.channels[Fringes(0, 8.0)]) / signals.energy.projector).mean())
+    assert contrast[1] == pytest.approx(contrast[0], rel=3e-3)  # without the width of pixels 1 / sinc(1 / 8) = 1.026
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["columns", "rows"])

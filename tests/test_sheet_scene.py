@@ -12,7 +12,7 @@ import pytest
 from delta_scenes import matte, scene_of, wall
 
 from rangesim.light_transport.caustic_sheets import Sheets
-from rangesim.light_transport.sheet_scene import SheetScene
+from rangesim.light_transport.sheet_scene import EVERY, FAINT, GROUPS, SheetScene
 
 CELLS, WAYS = 12, 20
 PROJECTOR_AT = np.array([0.2, 0.6, 0.0])
@@ -30,7 +30,8 @@ def sheets_over_a_square(level: float) -> Sheets:
     columns: list[Any] = [np.concatenate([np.asarray(c, np.float32)] * WAYS) for c in vertices]
     key = np.repeat(np.arange(WAYS, dtype=np.uint32) << 8, len(cell))
     flux = np.full(len(triangles), level / len(cell))
-    return Sheets(*columns, triangles, flux, np.zeros(len(triangles), np.uint32), key, 0.0, 1.0)
+    distance = np.linalg.norm(columns[0][triangles[:, 0]] - PROJECTOR_AT, axis=1)
+    return Sheets(*columns, triangles, flux, distance**-2, np.zeros(len(triangles), np.uint32), key, 0.0, 1.0)
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +63,7 @@ def total(light: SheetScene, point: mi.Point3f, turn: mi.UInt32, which: mi.UInt3
     return found_w
 
 
-@pytest.mark.parametrize("level", [1.0, 1e-2, 2e-3])
+@pytest.mark.parametrize("level", [1.0, 0.03, 1e-2, 2e-3])
 def test_a_point_gets_the_light_of_all_triangles_that_cover_it(level: float) -> None:
     """Bright ones are all found in every sample, and faint ones in turn."""
     irradiance, is_faint = irradiance_of_level(level, seed=0)
@@ -79,24 +80,36 @@ def test_the_faintest_triangles_are_drawn_by_lot_and_right_on_average() -> None:
 
 def irradiance_of_level(level: float, seed: int) -> tuple[np.ndarray, bool]:
     """Irradiance of points of the square that triangles of a level light, and whether these are faint."""
-    light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, 1.0, samples=32, seed=seed)
-    n, period = 1 << 16, int(light.groups[0]) * int(light.every[0])
+    light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, seed)
+    n = 1 << 16
     x, y = np.random.default_rng(0).random((2, n)).astype(np.float32)
     point = mi.Point3f(mi.Float(x - 0.3), mi.Float(y + 0.1), mi.Float(1.0))
-    faint = level < 0.02
-    turn = mi.UInt32((np.arange(n) % (period // int(light.every[0])) * int(light.every[0])).astype(np.uint32))
-    irradiance = total(light, point, turn, dr.full(mi.UInt32, int(faint), n)).numpy() / (
-        int(light.every[0]) if faint else 1
-    )
-    return irradiance, faint
+    faint = level < FAINT
+    turn = mi.UInt32((np.arange(n) % GROUPS * EVERY).astype(np.uint32))
+    irradiance = total(light, point, turn, dr.full(mi.UInt32, int(faint), n)).numpy()
+    return irradiance / (EVERY if faint else 1), faint
 
 
 def test_heights_do_not_depend_on_other_triangles() -> None:
     """One triangle more, which a rounding brings, changes no other."""
     all_of_them = sheets_over_a_square(2e-3)
-    some = all_of_them._replace(triangles=all_of_them.triangles[7:], flux=all_of_them.flux[7:],
-                                shape=all_of_them.shape[7:], key=all_of_them.key[7:])  # fmt: skip
-    scenes = [SheetScene(one, PROJECTOR_AT, 1.0, 32).scene for one in (all_of_them, some)]
+    per_triangle = ("triangles", "flux", "direct", "shape", "key")
+    some = all_of_them._replace(**{name: getattr(all_of_them, name)[7:] for name in per_triangle})
+    scenes = [SheetScene(one, PROJECTOR_AT).scene for one in (all_of_them, some)]
     corners = [mi.traverse(one)["light.vertex_positions"].numpy() for one in scenes]
     assert len(np.unique(corners[0][2::3])) > 0.99 * len(corners[0]) // 9  # a height for each
     np.testing.assert_array_equal(corners[0][63:], corners[1])
+
+
+@pytest.mark.parametrize("at", [[0.0, 0.0, 0.0], [0.2, 0.6, 0.0], [-5.0, 0.3, 0.9], [0.21, 0.6, 0.8]])
+@pytest.mark.parametrize(("level", "is_faint"), [(1.0, False), (2e-3, True)])
+def test_light_is_looked_for_wherever_there_is_some(at: list[float], level: float, is_faint: bool) -> None:
+    """Directions from any place of the projector, far from the triangles or close to them."""
+    light = SheetScene(sheets_over_a_square(level), np.array(at))
+    x, y = np.random.default_rng(0).random((2, 1 << 14)).astype(np.float32)
+    point = mi.Point3f(mi.Float(x - 0.3), mi.Float(y + 0.1), mi.Float(1.0))
+    found = light.may_light(point, mi.Bool(True))
+    assert found[is_faint].numpy().all()
+    assert not found[not is_faint].numpy().any()
+    behind = light.may_light(2 * mi.Point3f(*at) - mi.Vector3f(point), mi.Bool(True))
+    assert (behind[0] | behind[1]).numpy().mean() < 0.05

@@ -91,45 +91,6 @@ def test_wrong_reflectances_are_refused(bsdf: dict[str, Any], message: str) -> N
         load_scene(board(bsdf))
 
 
-def test_lamps_that_glass_keeps_away_are_warned_of() -> None:
-    matte = {"type": "diffuse", "reflectance": 0.5}
-    pane = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.1, "bsdf": {"type": "dielectric"}}
-    sun = {"type": "directional", "direction": [0.0, 0.0, 1.0], "irradiance": 1.0}
-    assert advice(board(matte, sun=sun)) == []
-    assert advice(board(matte, pane=pane, sky={"type": "constant"})) == []
-    (said,) = advice(board(matte, pane=pane, sun=sun))
-    assert "does not pass glass or holes (mask, null) and is missing behind it" in said
-
-
-CHECKS = {"type": "checkerboard"}
-PAPER: dict[str, Any] = {"type": "diffuse", "reflectance": 0.5}
-SHEETS: list[tuple[dict[str, Any], int]] = [
-    ({"type": "thindielectric"}, 1),
-    ({"type": "mask", "opacity": 0.0, "b": PAPER}, 1),
-    ({"type": "mask", "opacity": 0.5, "b": PAPER}, 1),
-    ({"type": "mask", "opacity": CHECKS, "b": PAPER}, 1),
-    ({"type": "mask", "opacity": 1.0, "b": {"type": "thindielectric"}}, 1),
-    ({"type": "null"}, 1),
-    ({"type": "mask", "opacity": 1.0, "b": PAPER}, 0),
-    (PAPER, 0),
-]
-
-
-@pytest.mark.parametrize(("bsdf", "count"), SHEETS)
-@pytest.mark.parametrize("lamp", ["directional", "point", "spot"])
-def test_lamps_that_thin_glass_or_holes_keep_away_are_warned_of(bsdf: dict[str, Any], count: int, lamp: str) -> None:
-    sheet = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.1, "bsdf": bsdf}
-    said = advice(board(PAPER, sheet=sheet, lamp={"type": lamp}))
-    assert ["is missing behind it" in one for one in said] == [True] * count
-    assert advice(board(PAPER, sheet=sheet, sky={"type": "constant"})) == []
-
-
-def test_lamps_reach_what_is_in_a_medium_without_a_warning() -> None:
-    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
-    ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.1, "bsdf": {"type": "null"}, "interior": fog}
-    assert advice(board(PAPER, ball=ball, lamp={"type": "point"})) == []
-
-
 @pytest.mark.parametrize("name", scene_names())
 def test_scenes_of_our_own_need_no_advice(name: str) -> None:
     assert advice(name) == []

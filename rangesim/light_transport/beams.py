@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.camera_rays import Connection, Device, lit_from
+from rangesim.light_transport.cutouts import Cutouts
 from rangesim.light_transport.ray_tables import GAUSSIAN_FULL_WIDTH, VectorTable
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Beam, Rig
@@ -257,10 +258,12 @@ class BeamDevice:
         pixel: mi.UInt32,
         media: Media | None = None,
         inside: Medium | None = None,
+        cutouts: Cutouts | None = None,
     ) -> Connection:
         """Straight connection of the point `si` to the emitter of the beam of its pixel, see `Device.connect`.
 
-        The irradiance is given per watt of the beam.
+        The irradiance is given per watt of the beam. Holes count as delta interactions, so no connection goes through
+        `cutouts`.
         """
         beam = self.at(pixel)
         to_emitter = mi.Vector3f(beam.origin) - mi.Vector3f(si.p)

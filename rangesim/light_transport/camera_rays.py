@@ -15,8 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.cutouts import Cutouts
 from rangesim.light_transport.sampling import GOLDEN_STEP
 from rangesim.light_transport.scattering import Media, Medium
+from rangesim.light_transport.surfaces import ray_to_emitter
 from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.rig.camera_model import CameraModel, appears, distort, project, unproject
 
@@ -77,17 +79,25 @@ def lit_from(
     active: mi.Bool,
     media: Media | None,
     inside: Medium | None,
+    cutouts: Cutouts | None = None,
 ) -> tuple[mi.Bool, mi.Float]:
-    """Whether light comes straight from the emitter to the point `si`, and `geometry` less what media on the way take.
+    """Whether light comes straight from the emitter to the point `si`, and `geometry` less what media and the surfaces
+    around holes on the way take.
 
     Parameters
     ----------
-    geometry : Float, see `Connection`, without media.
+    geometry : Float, see `Connection`, without media and holes.
     media, inside : the media of the scene, and the one in which the point lies; None in scenes without any.
+    cutouts : the holes of the scene; None: light goes through none.
     """
-    if media is None or inside is None:
-        return active & ~scene.ray_test(si.spawn_ray_to(emitter), coherent=False, active=active), geometry
-    fraction, _ = media.transmittance(scene, si, emitter, inside, active)
+    if cutouts is not None and not cutouts.exist:
+        cutouts = None
+    if media is not None and inside is not None:
+        fraction, _ = media.transmittance(scene, si, emitter, inside, active, cutouts=cutouts, ray_to=ray_to_emitter)
+    elif cutouts is not None:
+        fraction = cutouts.transmittance(si, emitter, active)
+    else:
+        return active & ~scene.ray_test(ray_to_emitter(si, emitter), coherent=False, active=active), geometry
     return active & (fraction > 0), geometry * fraction
 
 
@@ -256,8 +266,10 @@ class Device:
         pixel: mi.UInt32,
         media: Media | None = None,
         inside: Medium | None = None,
+        cutouts: Cutouts | None = None,
     ) -> Connection:
-        """Straight connection of the point `si` to the projector, through `media` if there are any.
+        """Straight connection of the point `si` to the projector, through `media` and the holes of `cutouts` if there
+        are any.
 
         All projector pixels have the same power. With E the irradiance at z = 1 m on the axis, the radiant intensity is
         E / cos^3. The irradiance on a surface that faces the projector is this times cos^2 / z^2, which is
@@ -279,13 +291,13 @@ class Device:
         if self.vignetting is not None:
             geometry *= self.relative_illumination(-to_projector)
         in_image &= active
-        lit, geometry = lit_from(scene, si, mi.Point3f(self.centre), geometry, in_image, media, inside)
+        lit, geometry = lit_from(scene, si, mi.Point3f(self.centre), geometry, in_image, media, inside, cutouts)
         blur = self.blur_px(z)
         return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))
 
 
 class CellGrid(NamedTuple):
-    """Cells of equal size that make up a device's image.
+    """Cells of equal size that make up the image of a projector.
 
     columns, rows : int, number of cells along x and y.
     size : Point2f, pixels, size of a cell.
@@ -298,11 +310,13 @@ class CellGrid(NamedTuple):
     pixels_per_cell: float
 
     @classmethod
-    def of(cls, device: Device) -> CellGrid:
-        """The cells of a device's image: its pixels, or squares of them if there are more than `MAX_CELLS` pixels."""
-        w, h = (int(n[0]) for n in device.size)
-        edge = max(1, math.ceil(math.sqrt(w * h / MAX_CELLS)))
-        columns, rows = -(-w // edge), -(-h // edge)
+    def of(cls, w: int, h: int, fineness: float = 1.0) -> CellGrid:
+        """The cells of an image of w x h pixels: its pixels, or squares of them if there are more than `MAX_CELLS`.
+
+        Each pixel is divided into `fineness` cells along each axis.
+        """
+        edge = max(1, math.ceil(math.sqrt(w * h * fineness**2 / MAX_CELLS))) / fineness
+        columns, rows = math.ceil(w / edge), math.ceil(h / edge)
         size = mi.Point2f(dr.opaque(mi.Float, w / columns), dr.opaque(mi.Float, h / rows))
         return cls(columns, rows, size, w * h / (columns * rows))
 

@@ -27,8 +27,14 @@ MIN_FOOTPRINT = 0.1
 in a focus is not followed any finer."""
 FLAT_COSINE = 1 - 1e-6
 """Cosine between the normals at the corners of a triangle, above which its receiver counts as flat: rounding alone."""
-MAX_CUBES = 64
-"""Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
+MAX_UNEVENNESS = 0.05
+"""Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
+relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
+MAX_DIVISIONS = 8
+"""Largest number of times that a triangle is divided until it is small as seen from the projector, see
+`lit_directions`: enough for one that is as large as half of the sphere of directions."""
+MAX_WIDTH = 3
+"""Largest difference of the cubes along an axis in which the directions to a small triangle lie."""
 MAX_SPREAD = 2.0
 """Largest ratio between the areas over which equal light spreads within a block; with a smaller ratio more blocks are
 divided."""
@@ -140,13 +146,23 @@ def _off_middle(position, m, a, b):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def _is_faint(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
+    """Whether the light of one chain over a block is faint. r : (9,) int64, landings. pixels : edge of the block."""
+    area, plain = 0.0, (rule.pixel_m + rule.pixel_rad * landings.length[r[4]]) * pixels
+    for q in (0, 1, 3, 4):
+        area += triangle_area(landings.position, r[q], r[q + 1], r[q + 4])
+        area += triangle_area(landings.position, r[q], r[q + 4], r[q + 3])
+    return landings.part[r[4]] * plain * plain < rule.faint * area
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     """Whether light of one chain is so even over a block that triangles between its nine points describe it.
 
     r : (9,) int64, landings of the points, row by row.
     pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
     """
-    position, length = landings.position, landings.length
+    position, length, part = landings.position, landings.length, landings.part
     for k in (0, 2, 6, 8):
         if not _is_even(r[k], r[4], landings, rule):
             return False
@@ -155,13 +171,16 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
         size = triangle_area(position, r[q], r[q + 1], r[q + 4]) + triangle_area(position, r[q], r[q + 4], r[q + 3])
         total += size
         low, high = min(low, size), max(high, size)
-    plain = rule.angle * length[r[4]]
-    off = 0.0
+    plain = rule.pixel_m + rule.pixel_rad * length[r[4]]
+    off, uneven = 0.0, 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))
-    if landings.part[r[4]] * plain * plain * pixels * pixels < rule.faint * total:
+        uneven = max(uneven, abs(part[r[m]] - 0.5 * (part[r[a]] + part[r[b]])))
+    if _is_faint(r, landings, pixels, rule):
         return np.sqrt(off) < 0.25 * np.sqrt(total)
     footprint = min(max(np.sqrt(total) / pixels, MIN_FOOTPRINT * plain), plain)
+    if uneven > MAX_UNEVENNESS * part[r[4]]:
+        return False
     return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * rule.tolerance * footprint  # cells are half a block
 
 
@@ -224,30 +243,33 @@ def _write(triangles, flux, n, a, b, c, part, half_cell):  # type: ignore[no-unt
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ignore[no-untyped-def]
-    """Make triangles of the chains that are smooth over a block, and say which blocks are to be divided.
+def smooth_chains(blocks, grid, landings, rule, taken):  # type: ignore[no-untyped-def]
+    """Make triangles of the chains that are smooth over a block.
 
     blocks : Blocks. grid : Lattice. landings : Chains. rule : Rule.
-    meets : (n,) bool, whether some ray through the block meets a delta surface first.
-    taken, used : the set of names of blocks and chains that have triangles, and its size; the new set is returned.
+    taken : the set of names of blocks and chains that have triangles.
 
     Returns
     -------
-    triangles : (t, 3) int64, landings. flux : (t, 1) float64, pixels of the projector.
-    divides : (n,) bool. taken, used : the new set.
+    triangles : (8 p, 3) int64, landings, eight for each of p pairs of a block and a chain.
+    flux : (8 p, 1) float64, pixels of the projector.
+    pairs : (p, 3) int64, index of the block, key of the chain, and whether it is faint.
+    parts : (p, 1) float64, fraction of the light of the block in the chain.
+    rest : (n,) float64, fraction of the light of each block in all other chains.
+    is_dark : (n,) bool, whether no light of the block's points lands.
     """
     x, y, step = blocks.x, blocks.y, blocks.step
     triangles, flux = np.empty((1024, 3), np.int64), np.empty((1024, 1), np.float64)
-    divides, n = np.zeros(len(x), np.bool_), 0
+    pairs, parts = np.empty((128, 3), np.int64), np.empty((128, 1), np.float64)
+    rest, is_dark, n = np.zeros(len(x)), np.ones(len(x), np.bool_), 0
     points, r = np.empty(9, np.int64), np.empty(9, np.int64)
     half_cell = 0.125 * blocks.pixels**2
     for b in range(len(x)):
         for q in range(9):
             points[q] = grid.value[place_in(grid.table, (y[b] + q // 3 * step) * grid.columns + x[b] + q % 3 * step)]
-        wish, is_dark = 0.0, True
         for q in range(9):
             i = grid.head[points[q]]
-            is_dark &= i < 0
+            is_dark[b] &= i < 0
             while i >= 0:
                 key, is_new = landings.key[i], True
                 for p in range(q):
@@ -264,54 +286,66 @@ def smooth_chains(blocks, grid, landings, rule, meets, taken, used):  # type: ig
                         found += 1
                         part += landings.part[r[p]] / 9
                 if found < 9 or not _is_smooth(r, landings, blocks.pixels, rule):
-                    wish += part
+                    rest[b] += part
                 else:
+                    pairs, parts = _longer(pairs, n // 8 + 1), _longer(parts, n // 8 + 1)
+                    pairs[n // 8, 0], pairs[n // 8, 1] = b, key
+                    pairs[n // 8, 2], parts[n // 8, 0] = _is_faint(r, landings, blocks.pixels, rule), part
                     triangles, flux = _longer(triangles, n + 8), _longer(flux, n + 8)
                     for k in (0, 1, 3, 4):
                         for c, d in ((k + 1, k + 4), (k + 4, k + 3)):
                             n = _write(triangles, flux, n, r[k], r[c], r[d], landings.part, half_cell)
-                    taken = _with_room(taken, used)
-                    name = _name(x[b], y[b], step, grid.columns, key)
-                    taken[place_in(taken, name)] = name
-                    used += 1
-        # A surface that lies between the points is as good as a chain that is not whole
-        divides[b] = wish > rule.significant or (is_dark and meets[b])
-    return triangles[:n], flux[:n], divides, taken, used
+    return triangles[:n], flux[:n], pairs[: n // 8], parts[: n // 8], rest, is_dark
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type: ignore[no-untyped-def]
+def with_names(pairs, x, y, size, columns, taken, used):  # type: ignore[no-untyped-def]
+    """The set `taken` with the names of pairs of a block or a cell and a chain, see `_name`; and its size."""
+    for pair in range(len(pairs)):
+        taken = _with_room(taken, used)
+        b = pairs[pair, 0]
+        name = _name(x[b], y[b], size, columns, pairs[pair, 1])
+        taken[place_in(taken, name)] = name
+        used += 1
+    return taken, used
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def cells_of(blocks, grid, landings, rule, dropped, taken):  # type: ignore[no-untyped-def]
     """Make triangles of what is left in the cells of blocks that are not divided.
 
     dropped : (points,) float64, fraction of the light of each point that was not followed.
-    meets : (4 n,) bool, whether some ray through the cell meets a delta surface first.
 
     Returns
     -------
-    triangles, flux, taken, used : as `smooth_chains`.
+    triangles, flux, pairs, parts : as `smooth_chains`, but two triangles for each pair of a cell and a chain.
     left : (4 n,) float64, fraction of the light of each cell that has made no triangles, as its corners tell.
+    is_dark : (4 n,) bool, whether no light of the cell's corners lands.
     """
     x, y, step = blocks.x, blocks.y, blocks.step
     triangles, flux = np.empty((1024, 3), np.int64), np.empty((1024, 1), np.float64)
-    left, n = np.zeros(4 * len(x), np.float64), 0
+    pairs, parts = np.empty((128, 3), np.int64), np.empty((128, 1), np.float64)
+    left, is_dark, n = np.zeros(4 * len(x), np.float64), np.ones(4 * len(x), np.bool_), 0
     corners, r = np.empty(4, np.int64), np.empty(4, np.int64)
     half_cell = 0.125 * blocks.pixels**2
     for cell in range(4 * len(x)):
         cx, cy = x[cell >> 2] + (cell & 1) * step, y[cell >> 2] + (cell >> 1 & 1) * step
         for q in range(4):
             corners[q] = grid.value[place_in(grid.table, (cy + (q >> 1) * step) * grid.columns + cx + (q & 1) * step)]
-        is_dark = True
+        first = n // 2
         for q in range(4):
             left[cell] += 0.25 * dropped[corners[q]]
             i = grid.head[corners[q]]
-            is_dark &= i < 0
+            is_dark[cell] &= i < 0
             while i >= 0:
                 key = landings.key[i]
                 this, i = i, grid.after[i]
                 if is_taken(taken, cx, cy, step, grid.columns, grid.coarsest, key):
                     continue
-                name = _name(cx, cy, -step, grid.columns, key)
-                if taken[place_in(taken, name)] != EMPTY:
+                is_paired = False
+                for pair in range(first, n // 2):
+                    is_paired |= pairs[pair, 1] == key
+                if is_paired:
                     continue
                 if q == 0:
                     is_whole = True
@@ -319,17 +353,16 @@ def cells_of(blocks, grid, landings, rule, dropped, meets, taken, used):  # type
                         r[p] = _with_key(grid.head, grid.after, landings.key, corners[p], key)
                         is_whole &= r[p] >= 0
                     if is_whole and _lies_flat(r, landings, rule):
+                        pairs, parts = _longer(pairs, n // 2 + 1), _longer(parts, n // 2 + 1)
+                        pairs[n // 2, 0], pairs[n // 2, 1] = cell, key
+                        pairs[n // 2, 2] = False
+                        parts[n // 2, 0] = 0.25 * landings.part[r].sum()
                         triangles, flux = _longer(triangles, n + 2), _longer(flux, n + 2)
                         for c, d in ((1, 3), (3, 2)):
                             n = _write(triangles, flux, n, r[0], r[c], r[d], landings.part, half_cell)
-                        taken = _with_room(taken, used)
-                        taken[place_in(taken, name)] = name
-                        used += 1
                         continue
                 left[cell] += 0.25 * landings.part[this]
-        if is_dark and meets[cell]:
-            left[cell] = 1.0
-    return triangles[:n], flux[:n], left, taken, used
+    return triangles[:n], flux[:n], pairs[: n // 2], parts[: n // 2], left, is_dark
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -348,6 +381,60 @@ def _lies_flat(r, landings, rule):  # type: ignore[no-untyped-def]
         if not along * along > MIN_TILT_COSINE * MIN_TILT_COSINE * (nx * nx + ny * ny + nz * nz):
             return False
     return True
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def last_ways(triangles, landings, rule, side, nearest, flat):  # type: ignore[no-untyped-def]
+    """Rays along the last segment of light that lands in cells, which are pairs of triangles as `cells_of` makes them.
+
+    The places shift from row to row and from column to column by the golden ratio, as those of `CellGrid.probes`, so
+    that no line along rows or columns passes all of them by.
+
+    Parameters
+    ----------
+    triangles : (2 c, 3) int64. landings : Chains. rule : Rule. side : number of rays along each side of a cell.
+    nearest : fraction of the segment after which a ray starts.
+    flat : largest height of a flat receiver over where light lands, as a fraction of that of a curved one.
+
+    Returns
+    -------
+    rays : (c side^2, 8) float32, origin, direction, distance to where the light lands, and the largest difference to
+        that of the receiver, metres.
+    """
+    rays, n, golden = np.empty((len(triangles) // 2 * side * side, 8), np.float32), 0, 0.6180339887498949
+    weights, corners = np.empty(4), np.empty(4, np.int64)
+    for cell in range(len(triangles) // 2):
+        corners[0], corners[1], corners[2] = triangles[2 * cell]
+        corners[3] = triangles[2 * cell + 1, 2]
+        height = rule.sag
+        if min([_cosine(landings.normal, corners[0], corners[k]) for k in range(1, 4)]) > FLAT_COSINE:
+            height *= flat
+        for k in range(side * side):
+            i, j = k % side, k // side
+            a, b = (i + golden * (j + cell + 1) % 1.0) / side, (j + golden * (i + 3 * cell + 2) % 1.0) / side
+            weights[0], weights[1] = 1 - max(a, b), max(a - b, 0.0)
+            weights[2], weights[3] = min(a, b), max(b - a, 0.0)
+            way, slope, size, distance = 0.0, 0.0, 0.0, 0.0
+            for axis in range(3):
+                p, d, m = 0.0, 0.0, 0.0
+                for corner in range(4):
+                    p += weights[corner] * landings.position[corners[corner], axis]
+                    d += weights[corner] * landings.direction[corners[corner], axis]
+                    m += weights[corner] * landings.normal[corners[corner], axis]
+                rays[n, axis], rays[n, 3 + axis] = p, d
+                slope += d * m
+                size += d * d
+                distance += (p - rule.projector_at[axis]) ** 2
+            size = np.sqrt(size)
+            for corner in range(4):
+                way += weights[corner] * landings.last[corners[corner]]
+            way *= 1 - nearest
+            for axis in range(3):
+                rays[n, 3 + axis] /= size
+                rays[n, axis] -= way * rays[n, 3 + axis]
+            rays[n, 6], rays[n, 7] = way, height * np.sqrt(distance) * size / max(abs(slope), 1e-3)
+            n += 1
+    return rays
 
 
 # ---- Photons ---------------------------------------------------------------------------------------------
@@ -437,51 +524,18 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def crowd_of(position, triangles, shape, area, edge):  # type: ignore[no-untyped-def]
-    """(t,) float64, number of triangles that cover the surface around the middle of each of some triangles.
-
-    It is the area of the triangles in a cube over that of a face. The area of a triangle that is larger than a face is
-    dealt out to the cubes in which it lies. `edge` is that of the cubes in metres.
-    """
-    points = np.minimum(area / (edge * edge), MAX_CUBES).astype(np.int64) + 1
-    table = np.full(1 << int(np.log2(2 * points.sum() + 1) + 1), EMPTY, np.int64)
-    inside, crowd = np.zeros(len(table)), np.empty(len(triangles))
-    for t in range(len(triangles)):
-        for p in range(points[t]):
-            cube = _cube(position, triangles[t], shape[t], p, edge)
-            i = place_in(table, cube)
-            table[i] = cube
-            inside[i] += area[t] / points[t]
-    for t in range(len(triangles)):
-        crowd[t] = inside[place_in(table, _cube(position, triangles[t], shape[t], 0, edge))] / (edge * edge)
-    return crowd
-
-
-@cached_njit(nogil=True, error_model="numpy")
-def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-def]
-    """Name of the cube that holds a point of a triangle: its middle, or one of a sequence that fills it."""
-    b1, b2 = 1 / 3, 1 / 3
-    if point > 0:
-        b1, b2 = 0.7548776662466927 * point % 1.0, 0.5698402909980532 * point % 1.0
-        if b1 + b2 > 1:
-            b1, b2 = 1 - b1, 1 - b2
-    name = np.int64(shape)
-    for k in range(3):
-        x = (1 - b1 - b2) * position[vertices[0], k] + b1 * position[vertices[1], k] + b2 * position[vertices[2], k]
-        name = name * np.int64(HASH) + np.int64(np.floor(x / edge))
-    return abs(name)
-
-
-@cached_njit(nogil=True, error_model="numpy")
-def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift, offsets, middle):  # type: ignore[no-untyped-def]
+def lifted(  # type: ignore[no-untyped-def]
+    sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle
+):
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
     Parameters
     ----------
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
-    is_faint : (t,) bool. chance : (t,) float64, probability with which a faint triangle is kept; it then counts for
-        those that are not. salt : uint64, a random number of the pass.
+    copies : (t,) int64, number of groups in which a triangle lies, a power of 2; 0 for bright ones.
+    chance : (t,) float64, probability with which a faint triangle is kept; it then counts for those that are not.
+    salt : uint64, a random number of the pass.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
     offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
@@ -492,29 +546,87 @@ def lifted(sheets, scale, is_faint, chance, salt, groups, every, lift, flat_lift
     corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape.
     terms : (k, 3) float32, what the irradiance at the vertices is multiplied by, height over the surface in metres, and
         1 where the receiver is flat.
+    faint : (k,) bool.
     """
     position, normal, triangles, shape, key, image = sheets
     name = _names_of(triangles, key, image)
-    corners, names = np.empty((3 * len(triangles), 3), np.float32), np.empty((len(triangles), 4), np.uint32)
-    terms, n = np.empty((len(triangles), 3), np.float32), 0
+    most = np.maximum(copies, 1).sum()
+    corners, names = np.empty((3 * most, 3), np.float32), np.empty((most, 4), np.uint32)
+    terms, faint, n = np.empty((most, 3), np.float32), np.empty(most, np.bool_), 0
     for t in range(len(triangles)):
-        group, weight = 0, 1.0
-        if is_faint[t]:
+        step, weight = 0, 1.0
+        if copies[t] > 0:
             if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
                 continue
-            group, weight = 1 + (key[t] >> 8) % groups, groups * every / chance[t]
+            step, weight = groups // copies[t], groups * every / (copies[t] * chance[t])
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]
         bends = min(_cosine(normal, a, b), _cosine(normal, a, c)) < FLAT_COSINE
         height = (lift if bends else flat_lift)[t] * (uniform(name[t]) - 0.5)
+        for copy in range(max(copies[t], 1)):
+            group = 1 + ((key[t] >> 8) + copy * step) % groups if step > 0 else 0
+            for k in range(3):
+                v = triangles[t, k]
+                names[n, k] = v
+                for axis in range(3):
+                    place = position[v, axis] - middle[axis] + height * normal[v, axis]
+                    corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
+            names[n, 3] = shape[t]
+            terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
+            faint[n] = step > 0
+            n += 1
+    return corners[: 3 * n], names[:n], terms[:n], faint[:n]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def lit_directions(position, triangles, is_faint, cubes, reach):  # type: ignore[no-untyped-def]
+    """Which directions from the origin lead to triangles, as words of 16 cubes with two bits each (uint32).
+
+    The unit vectors lie in a cube of edge 2, which is divided into `cubes` along each edge. The lower bit of a cube
+    stands for bright triangles, the upper one for faint ones.
+
+    Parameters
+    ----------
+    position : (n, 3) float32, metres, vertices. triangles : (t, 3), their indices. is_faint : (t,) bool.
+    reach : radians by which the direction of a point that a triangle lights may differ from those of the triangle.
+    """
+    words = np.zeros(cubes**3 // 16 + 1, np.uint32)
+    stack = np.empty((3 * MAX_DIVISIONS + 4, 3, 3))
+    depth_of = np.empty(3 * MAX_DIVISIONS + 4, np.int64)
+    low, high, half = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3))
+    for t in range(len(triangles)):
         for k in range(3):
-            v = triangles[t, k]
-            names[n, k] = v
+            stack[0, k] = position[triangles[t, k]]
+        depth_of[0], n = 0, 1
+        bit = np.uint32(2 if is_faint[t] else 1)
+        while n:
+            n -= 1
+            widest = 0
             for axis in range(3):
-                place = position[v, axis] - middle[axis] + height * normal[v, axis]
-                corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
-        names[n, 3] = shape[t]
-        terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
-        n += 1
-    return corners[: 3 * n], names[:n], terms[:n]
+                least, most = 2.0, -2.0
+                for k in range(3):
+                    x, y, z = stack[n, k]
+                    d = stack[n, k, axis] / np.sqrt(x * x + y * y + z * z)
+                    least, most = min(least, d), max(most, d)
+                low[axis] = max(int((least - reach + 1) * 0.5 * cubes), 0)
+                high[axis] = min(int((most + reach + 1) * 0.5 * cubes), cubes - 1)
+                widest = max(widest, high[axis] - low[axis])
+            if widest > MAX_WIDTH and depth_of[n] < MAX_DIVISIONS:
+                a, b, c = stack[n, 0].copy(), stack[n, 1].copy(), stack[n, 2].copy()
+                half[0], half[1], half[2] = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+                depth = depth_of[n] + 1
+                for q in range(4):
+                    depth_of[n + q] = depth
+                stack[n, 0], stack[n, 1], stack[n, 2] = a, half[0], half[2]
+                stack[n + 1, 0], stack[n + 1, 1], stack[n + 1, 2] = half[0], b, half[1]
+                stack[n + 2, 0], stack[n + 2, 1], stack[n + 2, 2] = half[2], half[1], c
+                stack[n + 3, 0], stack[n + 3, 1], stack[n + 3, 2] = half[0], half[1], half[2]
+                n += 4
+                continue
+            for i in range(low[0], high[0] + 1):
+                for j in range(low[1], high[1] + 1):
+                    for k in range(low[2], high[2] + 1):
+                        cube = (i * cubes + j) * cubes + k
+                        words[cube >> 4] |= bit << np.uint32(2 * (cube & 15))
+    return words

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projector's light beyond glass and mirrors, as camera paths gather it.
+"""Light beyond glass and mirrors, as camera paths gather it.
 
 This module has the triangles of light made for a pass, and computes the light that they bring to a vertex of a camera
 path.
@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.beams import BeamDevice
-from rangesim.light_transport.caustic_sheets import Sheets, trace_sheets
-from rangesim.light_transport.delta_surfaces import has_delta
-from rangesim.light_transport.sheet_scene import Place, SheetScene
+from rangesim.light_transport.caustic_sheets import CAMERA_CELL, Sheets, trace_sheets
+from rangesim.light_transport.delta_surfaces import throws_caustics
+from rangesim.light_transport.lamps import lamp_sheets
+from rangesim.light_transport.sheet_scene import EVERY, Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -36,26 +38,47 @@ any amount of light. A smaller bound would darken caustics beside edges where fa
 def caustic_sheets(
     traced: TracedScene, rigs: Sequence[Rig], settings: TransportSettings, report: Callable[[], None] = lambda: None
 ) -> Sheets | None:
-    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction,
-    or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
+    """Triangles of light for a pass of any camera; None if the caller wants none, no surface has a delta interaction
+    other than holes, or no light landed. A beam needs none, see `rangesim.light_transport.beams`.
 
     Parameters
     ----------
     rigs : rigs of the pass, which share their emitter.
     report : called after each kernel launch.
     """
-    if not settings.caustics or not has_delta(traced.scene) or isinstance(traced.projector, BeamDevice):
+    if not settings.caustics or not throws_caustics(traced.scene) or isinstance(traced.projector, BeamDevice):
         return None
     pixel_rad = min(rig.camera.angle_of(1) for rig in rigs)
     return trace_sheets(traced, rigs[0].projector_power_w, settings.seed, pixel_rad, report)
 
 
-def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int, seed: int) -> SheetScene | None:
-    """The triangles as kernels see them; None if there are none. `samples` is the smallest number of a pixel, and
-    `seed` that of the pass."""
+def lamp_caustics(
+    traced: TracedScene,
+    rigs: Sequence[Rig],
+    ranges_m: Sequence[float],
+    settings: TransportSettings,
+    report: Callable[[], None] = lambda: None,
+) -> Sheets | None:
+    """Triangles of the light of lamps without extent, for a pass of any camera; None as for `caustic_sheets`.
+
+    Parameters
+    ----------
+    ranges_m : metres, typical distance of what each camera sees; NaN if it sees nothing.
+    """
+    pixels_m = [rig.camera.angle_of(1) * range_m for rig, range_m in zip(rigs, ranges_m, strict=True)]
+    if not settings.caustics or np.isnan(pixels_m).all():
+        return None
+    camera_at, projector_at = rigs[0].T_world_camera[:3, 3], rigs[0].T_world_projector[:3, 3]
+    return lamp_sheets(traced, CAMERA_CELL * float(np.nanmin(pixels_m)), camera_at, projector_at, settings.seed, report)
+
+
+def sheet_scene(sheets: Sheets | None, rig: Rig, seed: int) -> SheetScene | None:
+    """The triangles as kernels see them; None if there are none. `seed` is that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], rig.projector_irradiance, samples, seed)
+    # Points of a lens are sharp, so that light has the blur of the pixels alone
+    blur_px = None if rig.projector_lens.focus_m is None else 0.0
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], seed, blur_px)
 
 
 class Vertex(NamedTuple):
@@ -86,7 +109,7 @@ def caustic_light(
     is_later: mi.Bool,
     place: mi.UInt32,
     active: mi.Bool,
-) -> tuple[list[list[mi.Float]], mi.Float]:
+) -> tuple[list[list[mi.Float]], mi.Float, mi.Float]:
     """Add the light of all triangles that cover a vertex; returns the channels and the radiance (W/m2/sr) at the
     camera.
 
@@ -101,15 +124,17 @@ def caustic_light(
     si, bsdf = vertex.si, vertex.bsdf
     shape, normal = number_of(si.shape), mi.Normal3f(si.n)
     seen = dr.dot(si.to_world(si.wi), si.n)
-    radiance, way, which = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+    sharp, smooth = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
     last, total, chosen = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n), Place.none(n)
     # Later vertices bring little each, so they look in some samples alone, which count for all
     is_turn = sheets.is_turn(turn, dr.select(is_later, mi.UInt32(1), 0))
-    looks = sheets.may_light(shape, active & (~is_later | is_turn))
-    weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
+    bright, faint = sheets.may_light(si.p, active & (~is_later | is_turn))
+    faint &= is_turn
+    looks, way, which = bright | faint, dr.zeros(mi.Float, n), dr.select(bright, mi.UInt32(0), 1)
+    weight_of_bright = dr.select(is_later, mi.Float(EVERY), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
-        looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, is_turn, weight_of_bright]
+        looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, faint, weight_of_bright]
     ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
         ray, step, above = sheets.ray(si.p, normal, turn, which, way)
@@ -124,7 +149,7 @@ def caustic_light(
         pick = dr.select(which == 0, pick, dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction)))
         chosen = chosen.replaced(taken, found)
         counts = (total > 0) & dr.select(which == 0, is_here, ~hit)
-        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, is_turn, weight_of_bright]):
+        if dr.hint(counts, exclude=[si, bsdf, vertex, seen, is_later, place, faint, weight_of_bright]):
             light = sheets.light(chosen, si.p, counts)
             wo = si.to_local(-light.direction)
             value = bsdf.eval(mi.BSDFContext(), si, wo, counts)
@@ -134,12 +159,15 @@ def caustic_light(
             cosine = dr.maximum(dr.abs(light.cosine), dr.abs(lit) / MAX_COSINE_RATIO)
             on_one_side = counts & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
             brought = dr.select(on_one_side, vertex.throughput * total * mono(value) / cosine, 0)
-            radiance += brought
-            path = LightPath(light.u, light.v, vertex.length + light.length, vertex.is_first, mi.UInt32(CAUSTIC))
-            channels = accumulators.add(channels, path, brought, place, on_one_side, is_later)
+            is_smooth = is_later | (which == 1)
+            sharp += dr.select(is_smooth, 0, brought)
+            smooth += dr.select(is_smooth, brought, 0)
+            length = vertex.length + light.length
+            path = LightPath(light.u, light.v, length, vertex.is_first, mi.UInt32(CAUSTIC), sheets.blur_px)
+            channels = accumulators.add(channels, path, brought, place, on_one_side, is_smooth)
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)
         way = dr.select(hit, way + found.t + step, 0)
         which = dr.select(hit, which, which + 1)
-        looks &= (which == 0) | ((which == 1) & is_turn)
-    return channels, radiance
+        looks &= (which == 0) | ((which == 1) & faint)
+    return channels, sharp, smooth

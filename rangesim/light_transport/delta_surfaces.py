@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -12,27 +13,45 @@ import numpy as np
 from rangesim.light_transport.camera_rays import PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.surfaces import number_of, table_of
+from rangesim.scene.materials import is_cutout
 from rangesim.scene.media import is_boundary
+
+MAX_BOUNDARIES = 8
+"""Number of boundaries of media in a row behind which glass is looked for, so that the time is bounded. Glass behind
+more of them, such as in the fifth of five bodies of milk, throws no caustics."""
 
 
 def has_delta(scene: mi.Scene) -> bool:
-    """Whether some surface of a mitsuba.Scene has a delta interaction. Without one there are no caustics."""
-    return any(map(_is_delta, scene.shapes()))
+    """Whether some surface of a mitsuba.Scene has a delta interaction."""
+    return any(map(is_delta_surface, scene.shapes()))
 
 
-def _is_delta(shape: mi.Shape) -> bool:
+def throws_caustics(scene: mi.Scene) -> bool:
+    """Whether some surface of a mitsuba.Scene has a delta interaction that is no hole. Without one there are no
+    caustics."""
+    return any(map(deflects, scene.shapes()))
+
+
+def is_delta_surface(shape: mi.Shape) -> bool:
     """Whether the surface of a shape has a delta interaction, and is not the boundary of a medium."""
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
+def deflects(shape: mi.Shape) -> bool:
+    """Whether the surface of a shape has a delta interaction that is no hole; thin glass reflects as well."""
+    lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
+    return any(mi.has_flag(shape.bsdf().flags(), lobe) for lobe in lobes)
+
+
 def meets_delta(
-    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay]
+    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay], through_holes: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the first surface that each of `count` rays meets has a delta interaction.
+    """Whether the first surface that each of `count` rays meets, boundaries of media aside, has a delta interaction.
 
     Parameters
     ----------
     rays_of : function that returns the rays from one number up to another, such as those through pixels' centres.
+    through_holes : whether rays go on through surfaces whose only delta interactions are holes, as boundaries do.
 
     Returns
     -------
@@ -40,13 +59,47 @@ def meets_delta(
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    table = mi.Bool(table_of(scene, list(map(_is_delta, scene.shapes()))))
+    table = mi.Bool(table_of(scene, list(map(deflects if through_holes else is_delta_surface, scene.shapes()))))
+    passed = boundaries_of(scene, through_holes)
     for begin, end in launches.ranges(count):
         rays = rays_of(begin, end)
-        found = scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.direction))
-        delta = dr.gather(mi.Bool, table, number_of(found.shape), found.is_valid())
+        met = first_shape(scene, mi.Ray3f(rays.origin, rays.direction), passed)
+        delta = dr.gather(mi.Bool, table, met.number, met.exists)
         launches.evaluate([delta, rays.exists], end - begin)
         meets[begin:end] = delta.numpy()
         if rays.exists is not None:  # a distorted lens
             exists[begin:end] = rays.exists.numpy()
     return meets, exists
+
+
+class FirstShape(NamedTuple):
+    """The shape that a ray meets first, boundaries of media aside.
+
+    number : UInt32, its number (`surfaces.number_of`). exists : Bool, whether the ray meets one.
+    """
+
+    number: mi.UInt32
+    exists: mi.Bool
+
+
+def boundaries_of(scene: mi.Scene, and_holes: bool = False) -> mi.Bool | None:
+    """Table (`table_of`) of the shapes that are boundaries of media; None if there are none.
+
+    `and_holes` says whether shapes whose only delta interactions are holes count as well.
+    """
+    passed = [is_boundary(s) or (and_holes and is_cutout(s.bsdf()) and not deflects(s)) for s in scene.shapes()]
+    return mi.Bool(table_of(scene, passed)) if any(passed) else None
+
+
+def first_shape(scene: mi.Scene, ray: mi.Ray3f, boundaries: mi.Bool | None) -> FirstShape:
+    """The shape that each ray meets first, behind up to `MAX_BOUNDARIES` of the boundaries of media."""
+    found = scene.ray_intersect_preliminary(ray, coherent=False)
+    number, exists = number_of(found.shape), found.is_valid()
+    for _ in range(MAX_BOUNDARIES if boundaries is not None else 0):
+        passes = exists & dr.gather(mi.Bool, boundaries, number, exists)
+        si = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, passes)
+        ray = dr.select(passes, si.spawn_ray(ray.d), ray)
+        behind = scene.ray_intersect_preliminary(ray, coherent=False, active=passes)
+        found = dr.select(passes, behind, found)
+        number, exists = number_of(found.shape), dr.select(passes, behind.is_valid(), exists)
+    return FirstShape(number, exists)

@@ -161,7 +161,7 @@ def _first_surfaces(
     to_camera = mi.Vector3f(ray.origin) - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
     pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
-    link = traced.projector.connect(traced.scene, si, hit, pixel)
+    link = traced.projector.connect(traced.scene, si, hit, pixel, cutouts=traced.cutouts)
     through = dr.gather(mi.Bool, transmits_of, number_of(si.shape), hit)
     seen = scatterers.behind(si, hit)  # traced only if its fields are asked for
     return FirstSurfaces(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rangesim.light_transport.caustic_sheets import Sheets
-from rangesim.light_transport.caustics import caustic_sheets, sheet_scene
+from rangesim.light_transport.caustics import caustic_sheets, lamp_caustics, sheet_scene
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -90,11 +90,13 @@ def trace_light(
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
     views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
-    sheets = caustic_sheets(traced, [view.rig for view in views], settings, partial(report, 0.0))
+    here, at_work = [view.here for view in views], partial(report, 0.0)
+    sheets = caustic_sheets(traced, here, settings, at_work)
+    of_lamps = lamp_caustics(traced, here, [view.range_m for view in views], settings, at_work)
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
-        signals.append(view.trace(responses, sheets, launches, part))
+        signals.append(view.trace(responses, sheets, of_lamps, launches, part))
     return signals
 
 
@@ -140,10 +142,17 @@ class _CameraPass:
                 is_shared = (is_matte & (self.guides.instance >= 0)).ravel()
             self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
+    @property
+    def range_m(self) -> float:
+        """Median of the distances of what the camera sees, metres; NaN if it sees nothing."""
+        seen = self.truth.range_m[np.isfinite(self.truth.range_m)]
+        return float(np.median(seen)) if len(seen) else np.nan
+
     def trace(
         self,
         responses: Sequence[Response],
         sheets: Sheets | None,
+        of_lamps: Sheets | None,
         launches: Launches,
         report: Report,
     ) -> StillSignals:
@@ -152,14 +161,15 @@ class _CameraPass:
         Parameters
         ----------
         responses : responses whose channels are accumulated.
-        sheets : Sheets of the emitter; None: there are none.
+        sheets, of_lamps : Sheets of the emitter, and of lamps of the scene; None: there are none.
         launches : size of the kernel launches.
         report : function that is called with the fraction of this camera's work that is done, 0..1.
         """
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        view = View(self.traced, sheet_scene(sheets, self.here, fewest, settings.seed))
+        light, ambient = (sheet_scene(one, self.here, settings.seed) for one in (sheets, of_lamps))
+        view = View(self.traced, light, ambient)
         of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)

@@ -40,6 +40,7 @@ from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light
 from rangesim.light_transport.delta_surfaces import has_delta
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
+from rangesim.light_transport.lamps import lamps_of
 from rangesim.light_transport.sampling import (
     Continued,
     Seed,
@@ -87,6 +88,7 @@ class PathSettings(NamedTuple):
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
         are best.
+    delta_lamps : whether the scene has lamps without extent, and surfaces with delta interactions.
     refracts : whether light passes through some surface of the scene, so that the refractive index along a path may
         change.
     """
@@ -98,6 +100,7 @@ class PathSettings(NamedTuple):
     glint: bool
     ambient: bool
     samples_ambient: bool
+    delta_lamps: bool
     refracts: bool
 
     @classmethod
@@ -111,6 +114,7 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
+            delta_lamps=has_delta(scene.mitsuba) and len(lamps_of(scene.mitsuba)) > 0,
             refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
         )
 
@@ -246,10 +250,12 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the triangles of light (None: there are none)."""
+    """Everything that the lanes read: the scene with its devices, and the triangles of light, of the projector and of
+    lamps of the scene (None: there are none)."""
 
     traced: TracedScene
     sheets: SheetScene | None = None
+    of_lamps: SheetScene | None = None
 
 
 def trace(
@@ -419,7 +425,7 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, sheets = view
+    traced, sheets, of_lamps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
@@ -427,6 +433,7 @@ def walk(
     sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
+    nothing = Accumulators((), 1)  # the light of lamps is in no channel
     active = (state.sample < lanes.samples) & (left > 0)
 
     while active:
@@ -532,7 +539,7 @@ def walk(
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
             via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
             is_connected &= beam_connects((path.depth == 1) & is_own, via_delta, has_spot)
-        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside)
+        link = projector.connect(scene, si, is_connected, lanes.pixel, media, path.ray_state.inside, cutouts)
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
             comes_back = is_vertex & is_own & (path.depth == 1) & (path.chain > 0)
@@ -591,7 +598,7 @@ def walk(
         # ---- Caustics: light that reached this point through glass or off mirrors --------------------
         if dr.hint(sheets is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
-            state.channels, light = caustic_light(
+            state.channels, sharp, smooth = caustic_light(
                 sheets,
                 accumulators,
                 state.channels,
@@ -602,9 +609,9 @@ def walk(
                 lanes.place,
                 is_vertex & ~scatters,
             )
-            radiance.caustic += dr.select(is_later, 0, light)
-            radiance.smooth_caustic += dr.select(is_later, light, 0)
-            tally.indirect += dr.select(is_later, light, 0)
+            radiance.caustic += sharp
+            radiance.smooth_caustic += smooth
+            tally.indirect += dr.select(is_later, smooth, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -615,12 +622,26 @@ def walk(
             if dr.hint(settings.samples_ambient, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    light = sampled_ambient(traced, bsdf, si, path.ray_state, xi, is_vertex)
+                    light = sampled_ambient(traced, bsdf, si, path.ray_state, xi, settings.delta_lamps, is_vertex)
                 else:
                     light = sampled_ambient_through_media(
-                        traced, bsdf, si, ray.d, path.ray_state, scatters, xi, is_vertex
+                        traced, bsdf, si, ray.d, path.ray_state, scatters, xi, settings.delta_lamps, is_vertex
                     )
                 radiance.ambient += path.throughput * light
+            if dr.hint(of_lamps is not None, mode="scalar"):
+                vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, mi.Bool(False))
+                _, sharp, smooth = caustic_light(
+                    of_lamps,
+                    nothing,
+                    [],
+                    vertex,
+                    lanes.turn(number),
+                    lanes.pick(number),
+                    is_later,
+                    lanes.place,
+                    is_vertex & ~scatters,
+                )
+                radiance.ambient += sharp + smooth
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)

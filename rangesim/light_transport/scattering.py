@@ -10,12 +10,14 @@ Media that only absorb, inside bodies that refract, are in `rangesim.light_trans
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.cutouts import Cutouts
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
@@ -142,37 +144,53 @@ class Media:
         inside: Medium,
         active: mi.Bool,
         around: mi.Float = None,
+        cutouts: Cutouts | None = None,
+        ray_to: Callable[[mi.SurfaceInteraction3f, mi.Point3f], mi.Ray3f] | None = None,
     ) -> tuple[mi.Float, mi.Bool]:
         """Transmittance of the straight way from `si` to `target`, and whether the way crosses a boundary.
 
-        The transmittance is 0 where any surface other than the boundary of a medium stands in between.
+        The transmittance is 0 where any surface other than the boundary of a medium or a hole stands in between.
 
         Parameters
         ----------
         inside : Medium, in which the way starts.
         around : Float, 1/m, absorption coefficient outside the media that scatter; None: 0.
+        cutouts : Cutouts, holes that the way may go through; None: it goes through none.
+        ray_to : function that returns the ray from a surface to the target; None: Mitsuba's, for one on a surface.
         """
         start = mi.Point3f(si.p)
-        ray = mi.Ray3f(si.spawn_ray_to(target))
+        ray_to = ray_to or mi.SurfaceInteraction3f.spawn_ray_to
+        ray = mi.Ray3f(ray_to(si, target))
         sigma_t, thickness = mi.Float(inside.sigma_t), dr.zeros(mi.Float, dr.width(active))
         if dr.hint(around is not None, mode="scalar"):
             sigma_t = dr.select(sigma_t > 0, sigma_t, around)
         free, crossed, going = mi.Bool(active), dr.zeros(mi.Bool, dr.width(active)), mi.Bool(active)
+        fraction = dr.ones(mi.Float, dr.width(active)) if cutouts is not None else mi.Float(1)
         while going:
-            found = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=going)
+            if dr.hint(cutouts is not None, mode="scalar"):
+                assert cutouts is not None
+                found = cutouts.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=going)
+            else:
+                found = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=going)
             hit = going & found.is_valid()
             crosses = hit & self.bounded_by(found, hit)
-            free &= ~hit | crosses
+            passes = mi.Bool(crosses)
+            if dr.hint(cutouts is not None, mode="scalar"):
+                assert cutouts is not None
+                openness = cutouts.openness(found, hit)
+                fraction *= dr.select(openness > 0, openness, 1)
+                passes |= openness > 0
+            free &= ~hit | passes
             end = dr.select(hit, found.p, target)
             thickness += dr.select(going, sigma_t * dr.norm(end - start), 0)
             sigma_t = dr.select(crosses, self.beyond(found, ray.d, crosses).sigma_t, sigma_t)
             if dr.hint(around is not None, mode="scalar"):
                 sigma_t = dr.select(crosses & (sigma_t == 0), around, sigma_t)
             crossed |= crosses
-            start = dr.select(crosses, found.p, start)
-            ray = found.spawn_ray_to(target)
-            going = crosses & (thickness < OPAQUE)
-        return dr.select(free & (thickness < OPAQUE), dr.exp(-thickness), 0), crossed
+            start = dr.select(passes, found.p, start)
+            ray = ray_to(found, target)
+            going = passes & (thickness < OPAQUE)
+        return dr.select(free & (thickness < OPAQUE), fraction * dr.exp(-thickness), 0), crossed
 
 
 def media_of(scene: mi.Scene) -> Media | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees of specular chains: the light of a point of the projector's image on its way through glass and off mirrors.
+"""Trees of specular chains: the light of a point of a source's image on its way through glass and off mirrors.
 
 At glass a ray splits in two: one part is reflected, the other refracted. Both are followed, each with its fraction of
 the light, so a point of the image always lights the same places. A chain is named by a key, which depends on the
@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.camera_rays import Device, PrimaryRay
+from rangesim.light_transport.delta_sources import DeltaSource
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import Continued
 from rangesim.light_transport.spectrum import mono
@@ -30,6 +30,11 @@ from rangesim.light_transport.traced_scene import TracedScene
 PARTS = 6
 """Largest number of weaker parts that a ray stores in a launch. Light through three panes meets six faces. A part that
 finds no room is dropped by a point of the grid; a photon then follows one of the two parts by chance."""
+EARLIER = 3
+"""Largest number of landings of a lane before its last one, in scenes with coats: light that met four coats has less
+than a hundred-thousandth left, unless it grazes them."""
+LANDED_PART = 2
+"""Place of `part` among the leaves of a landing."""
 LAUNCHES = 3
 """Largest number of launches for points of the grid. In the last one nothing is stored: weaker parts are dropped,
 because light that was the weaker part twice carries little."""
@@ -38,6 +43,8 @@ LAUNCHES_OF_PHOTONS = 2
 is in the first."""
 HASH_STEP = 0x9E3779B1
 """Odd factor of the hash that names chains: 2^32 divided by the golden ratio, rounded to a prime."""
+HASH_FACTOR = 0x85EBCA6B
+"""A second odd factor of this hash, whose bits have nothing to do with those of the first (MurmurHash3, Appleby)."""
 NORMAL_STEPS = 1000.0
 """Number of steps per unit to which the normals of flat faces are rounded in a key, so that light through different
 faces of a mesh has different keys; faces closer than 0.06 degrees count as one."""
@@ -54,7 +61,7 @@ class Parts(NamedTuple):
     origin, direction : Point3f and Vector3f, world.
     state : RayState.
     key : UInt32, name of the chain so far.
-    chain : UInt32, number of delta interactions so far.
+    chain : UInt32, number of delta interactions so far, holes and boundaries of media aside.
     random : UInt64, state of the random numbers; None for points of the grid.
     """
 
@@ -77,6 +84,7 @@ class Landings(NamedTuple):
     part : (m,) float32, fraction of the light of the point.
     length : (m,) float32, metres, optical length.
     ior : (m,) float32, refractive index in front of the surface.
+    last : (m,) float32, metres, distance from the last delta interaction.
     position, normal, direction : (m, 3) float32, world; metres, geometric normal, and direction of flight.
     """
 
@@ -86,17 +94,18 @@ class Landings(NamedTuple):
     part: np.ndarray
     length: np.ndarray
     ior: np.ndarray
+    last: np.ndarray
     position: np.ndarray
     normal: np.ndarray
     direction: np.ndarray
 
 
 class SpecularTree:
-    """Follows the projector's light through the delta surfaces of a scene.
+    """Follows light through the delta surfaces of a scene.
 
     Parameters
     ----------
-    traced : TracedScene, whose emitter is a projector.
+    traced : TracedScene
     launches : Launches.
     """
 
@@ -107,16 +116,22 @@ class SpecularTree:
         self.order = mi.UInt32(table_of(traced.scene, np.arange(len(shapes), dtype=np.uint32)))
         self.is_flat = mi.Bool(table_of(traced.scene, [_is_flat(shape) for shape in shapes]))
         self.is_exact = mi.Bool(table_of(traced.scene, [_is_exact(shape.bsdf()) for shape in shapes]))
-        self.max_chain = dr.opaque(mi.UInt32, MAX_CHAIN)
+        self.lands_twice = sum(_lands_and_goes_on(shape.bsdf()) for shape in shapes) > 0
+        self.max_chain, self.earlier = dr.opaque(mi.UInt32, MAX_CHAIN), dr.opaque(mi.UInt32, EARLIER)
 
     def follow(
-        self, primary: PrimaryRay, fewest: float, random: mi.UInt64 | None = None
+        self,
+        source: DeltaSource,
+        pixel: mi.Point2f,
+        lens: mi.Point2f | None,
+        fewest: float,
+        random: mi.UInt64 | None = None,
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image to where it lands.
 
         Parameters
         ----------
-        primary : PrimaryRay, n rays.
+        pixel, lens : n points of the image, and the point of the lens, as for `DeltaSource.rays`.
         fewest : fraction of a point's light below which a part is dropped. Photons keep some of these parts by Russian
             roulette, so that none is left out in the mean.
         random : UInt64, states of the random numbers of photons; None for points of the grid, which drop parts and are
@@ -127,14 +142,11 @@ class SpecularTree:
         landings : Landings.
         dropped : (n,) float64, fraction of each point's light in parts that were dropped.
         """
-        traced = self.traced
-        assert isinstance(traced.projector, Device)
+        primary, fraction = source.rays(pixel, lens)
         n = dr.width(primary.direction)
-        one = dr.ones(mi.Float, n)
-        state = RayState.start(traced, n).restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
-        part = one * traced.projector.relative_illumination(primary.direction)
-        if primary.exists is not None:
-            part = dr.select(primary.exists, part, 0)
+        state = source.start(self.traced, n)
+        state = state.restarted(True, primary.origin, primary.path_offset + dr.zeros(mi.Float, n))
+        part = dr.ones(mi.Float, n) * fraction
         origin = mi.Point3f(primary.origin) + dr.zeros(mi.Point3f, n)
         none = dr.zeros(mi.UInt32, n)
         parts = Parts(dr.arange(mi.UInt32, n), part, origin, primary.direction, state, none, mi.UInt32(none),
@@ -150,21 +162,24 @@ class SpecularTree:
             dr.make_opaque(leaves)
             parts = _rebuilt(parts, list(leaves))
             lanes = dr.width(parts.part)
-            stored = _Stored(leaves, lanes)
-            landing, lost = _strongest(self, parts, stored, chance)
-            self.launches.evaluate([landing, stored.leaves, lost], lanes)
-            dropped += np.bincount(parts.point.numpy(), lost.numpy(), n)  # in the same order on any machine
-            landed = dr.compress(landing.part > 0)
-            columns = [dr.gather(type(x), x, landed) for x in (parts.point, *_leaves(landing))]
-            dr.eval(columns)
-            found.append([x.numpy() for x in columns])
+            stored = _Stored(parts, lanes, PARTS)
+            earlier = _Stored(_Landing.none(lanes), lanes, EARLIER) if self.lands_twice else None
+            landing, lost = _strongest(self, parts, stored, earlier, chance)
+            self.launches.evaluate([landing, stored.leaves, lost, earlier.leaves if earlier else []], lanes)
+            point = parts.point.numpy()
+            dropped += np.bincount(point, lost.numpy(), n)  # in the same order on any machine
+            for leaves in [_leaves(landing), *([earlier.leaves] if earlier else [])]:
+                landed = dr.compress(leaves[LANDED_PART] > 0)
+                columns = [dr.gather(type(x), x, landed) for x in leaves]
+                dr.eval(columns)
+                found.append([point[landed.numpy() % lanes], *(x.numpy() for x in columns)])
             rest = dr.compress(stored.part > 0)
             if not len(rest):
                 break
             parts = _rebuilt(parts, [dr.gather(type(x), x, rest) for x in stored.leaves])
         numbers = [np.concatenate(column) for column in zip(*found, strict=True)]
-        vectors = [np.column_stack(numbers[k : k + 3]) for k in (6, 9, 12)]
-        return Landings(*numbers[:6], *vectors), dropped
+        vectors = [np.column_stack(numbers[k : k + 3]) for k in (7, 10, 13)]
+        return Landings(*numbers[:7], *vectors), dropped
 
 
 @dataclass
@@ -176,48 +191,53 @@ class _Landing:
     part: mi.Float
     length: mi.Float
     ior: mi.Float
+    last: mi.Float
     position: mi.Point3f
     normal: mi.Vector3f
     direction: mi.Vector3f
 
+    @classmethod
+    def none(cls, lanes: int) -> _Landing:
+        """No landing on any lane."""
+        whole, real = [dr.zeros(mi.UInt32, lanes) for _ in range(2)], [dr.zeros(mi.Float, lanes) for _ in range(4)]
+        return cls(*whole, *real, *(dr.zeros(kind, lanes) for kind in (mi.Point3f, mi.Vector3f, mi.Vector3f)))
+
 
 class _Stored:
-    """Room for the weaker parts of each lane. Dr.Jit does not look into this class, so loops do not carry the arrays.
+    """Room for `Parts` or landings of each lane. Dr.Jit does not look into this class, so loops do not carry the
+    arrays.
 
     Parameters
     ----------
-    like : leaves of `Parts`.
-    lanes : int.
+    like : a structure as those to be stored.
+    lanes : int. room : largest number of structures of a lane.
     """
 
-    def __init__(self, like: list[Any], lanes: int) -> None:
+    def __init__(self, like: Parts | _Landing, lanes: int, room: int) -> None:
         self.lane, self.lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, lanes)
-        self.leaves = [dr.empty(type(x), PARTS * lanes) for x in like]
-        self.leaves[PART_LEAF] = dr.zeros(mi.Float, PARTS * lanes)
+        self.leaves = [dr.empty(type(x), room * lanes) for x in _leaves(like)]
+        self.place = next(i for i, x in enumerate(_leaves(like)) if x is like.part)
+        self.leaves[self.place] = dr.zeros(mi.Float, room * lanes)
 
     @property
     def part(self) -> mi.Float:
-        """Fraction of the light of each part that was stored; 0 where there is none."""
-        return self.leaves[PART_LEAF]
+        """Fraction of the light of each structure that was stored; 0 where there is none."""
+        return self.leaves[self.place]
 
-    def add(self, parts: Parts, number: mi.UInt32, active: mi.Bool) -> None:
-        """Store a part of each lane, after `number` that the lane stored before."""
+    def add(self, parts: Parts | _Landing, number: mi.UInt32, active: mi.Bool) -> None:
+        """Store a structure of each lane, after `number` that the lane stored before."""
         place = dr.fma(number, self.lanes, self.lane)
         for target, value in zip(self.leaves, _leaves(parts), strict=True):
             dr.scatter(target, value, place, active)
 
 
-PART_LEAF = 1
-"""Place of `part` among the leaves of `Parts`."""
-
-
 @dr.syntax
-def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
+def _strongest(tree, parts, stored, earlier, numbers):  # type: ignore[no-untyped-def]
     """Follow every part along the stronger of the two parts into which surfaces split it.
 
     Returns
     -------
-    landing : _Landing.
+    landing : _Landing, the last of each lane; those before it are in `earlier`.
     lost : Float, fraction of the light in parts that were dropped.
     """
     traced = tree.traced
@@ -232,11 +252,7 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
     part, key, chain, random = parts.part, parts.key, parts.chain, parts.random
     number = dr.zeros(mi.UInt32, n)  # of parts stored
     lost, left = dr.zeros(mi.Float, n), tree.max_chain + dr.zeros(mi.UInt32, n)
-    none, vector = dr.zeros(mi.UInt32, n), dr.zeros(mi.Vector3f, n)
-    part_0, length_0, ior_0 = (dr.zeros(mi.Float, n) for _ in range(3))
-    landing = _Landing(
-        none, mi.UInt32(none), part_0, length_0, ior_0, dr.zeros(mi.Point3f, n), vector, mi.Vector3f(vector)
-    )
+    landing, landings = _Landing.none(n), dr.zeros(mi.UInt32, n)
     active = part > 0
     while active:
         # ---- Next surface ----------------------------------------------------------------------------
@@ -256,8 +272,12 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
 
         # ---- Light that the surface scatters lands here ------------------------------------------------
         lands = hit & can_be_vertex(bsdf) & (chain > 0)
-        name = (key ^ order) * HASH_STEP
-        here = _Landing(name, shape, part, state.length, state.ior, point, mi.Vector3f(si.n), ray.d)
+        last, normal = dr.norm(point - state.previous), mi.Vector3f(si.n)
+        here = _Landing(_named(key, 3 * order), shape, part, state.length, state.ior, last, point, normal, ray.d)
+        if dr.hint(earlier is not None, mode="scalar"):
+            again = lands & (landing.part > 0) & (landings < tree.earlier)
+            earlier.add(landing, landings, again)
+            landings += dr.select(again, mi.UInt32(1), mi.UInt32(0))
         landing = dr.select(lands, here, landing)
 
         # ---- The rest splits into a reflected and a refracted part -------------------------------------
@@ -284,9 +304,13 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
         start = state.restarted(mirrors, point, state.length)
         after_r = start.entering(traced, si, d_r, mirrors, mi.Bool(False))
         after_t = start.refracted(bs_t, mirrors).entering(traced, si, d_t, mirrors, crosses)
-        key_r, key_t = (key ^ place) * HASH_STEP + 1, (key ^ place) * HASH_STEP + 2
+        key_r, key_t = _named(key, 3 * place + 1), _named(key, 3 * place + 2)
         o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
-        chain += dr.select(mirrors & ~crosses, mi.UInt32(1), mi.UInt32(0))
+        # Next-event estimation owns the light that went through nothing but holes
+        passes = mi.Bool(crosses)
+        if dr.hint(traced.cutouts is not None, mode="scalar"):
+            passes |= traced.cutouts.passed(si, bs_t, mirrors)
+        chain_r, chain_t = (chain + dr.select(w, mi.UInt32(1), mi.UInt32(0)) for w in (mirrors, mirrors & ~passes))
 
         # ---- The weaker one is stored, the stronger one goes on ----------------------------------------
         weaker, stronger = dr.minimum(part_r, part_t), dr.maximum(part_r, part_t)
@@ -307,16 +331,28 @@ def _strongest(tree, parts, stored, numbers):  # type: ignore[no-untyped-def]
             lost += dr.select(stronger < tree.fewest, stronger, 0)
             stronger = dr.select(stronger < tree.fewest, 0, stronger)
         aside = Parts(parts.point, kept, dr.select(turns, o_t, o_r), dr.select(turns, d_t, d_r),
-                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r), chain, random)  # fmt: skip
+                      dr.select(turns, after_t, after_r), dr.select(turns, key_t, key_r),
+                      dr.select(turns, chain_t, chain_r), random)  # fmt: skip
         stored.add(aside, number, kept > 0)
         number += dr.select(kept > 0, mi.UInt32(1), mi.UInt32(0))
-        part, key = stronger, dr.select(turns, key_r, key_t)
+        part, key, chain = stronger, dr.select(turns, key_r, key_t), dr.select(turns, chain_r, chain_t)
         origin, direction = dr.select(turns, o_r, o_t), dr.select(turns, d_r, d_t)
         state = dr.select(turns, after_r, after_t)
         left -= 1
         lost += dr.select(left == 0, part, 0)
         active &= mirrors & (part > 0) & (left > 0)
     return landing, lost
+
+
+def _named(key: mi.UInt32, step: mi.UInt32) -> mi.UInt32:
+    """Name of a chain after a further step, so mixed that two chains hardly ever have the same name.
+
+    Without the shifts, light that is reflected and light that is refracted would have one name on two shapes whose
+    numbers differ in their last bits.
+    """
+    x = (key ^ step * HASH_STEP) * HASH_FACTOR
+    x = (x ^ (x >> 15)) * HASH_STEP
+    return x ^ (x >> 16)
 
 
 def _mixed(numbers: list[mi.UInt32]) -> mi.UInt32:
@@ -329,6 +365,11 @@ def _is_flat(shape: mi.Shape) -> bool:
     """Whether a shape is a mesh whose faces look flat."""
     is_mesh = shape.shape_type() == mi.ShapeType.Mesh.value
     return bool(is_mesh and (shape.has_face_normals() or not shape.has_vertex_normals()))
+
+
+def _lands_and_goes_on(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF both scatters light and has delta lobes, as a polished coat."""
+    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def _is_exact(bsdf: mi.BSDF) -> bool:

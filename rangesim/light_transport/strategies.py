@@ -2,8 +2,8 @@
 """The strategies that bring light from the projector to the camera, and which of them owns a light path.
 
 A vertex of a light path is a surface point where light scatters into many directions, or a scattering event inside a
-medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats,
-holes), which send it on in single directions.
+medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats),
+which send it on in single directions. Holes send it on as if nothing were there, so a segment may go through them.
 
 Three strategies bring the projector's light to the camera. They partition all light paths: each path belongs to one of
 them, so that no light is counted twice and none is left out. `owner` says which strategy a path belongs to.

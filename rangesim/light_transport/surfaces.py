@@ -187,6 +187,18 @@ def _table(scene: mi.Scene, members: list[int], values: ArrayLike) -> np.ndarray
     return table_of(scene, of_shapes)
 
 
+END = 1e-5
+"""Fraction of its length by which a ray to an emitter ends early, so that a surface through the emitter does not hide
+it. Mitsuba's fraction is 90 times as large: glass 9 mm before an emitter would be passed by, from 10 m."""
+
+
+def ray_to_emitter(si: mi.SurfaceInteraction3f, emitter: mi.Point3f) -> mi.Ray3f:
+    """The ray from a surface to an emitter that is no surface itself, up to `END` before it."""
+    ray = si.spawn_ray_to(emitter)
+    ray.maxt *= (1 - END) / (1 - mi.math.ShadowEpsilon)
+    return ray
+
+
 # ---- Tables of what is known of each shape ---------------------------------------------------------------
 #
 # A kernel that asks the shapes themselves makes a virtual call. Dr.Jit then traces the code of every shape of the

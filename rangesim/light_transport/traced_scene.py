@@ -41,5 +41,6 @@ class TracedScene(NamedTuple):
         """A traced scene of a mitsuba.Scene that `rangesim.scene.load_scene` has checked, and a rig in its
         coordinates."""
         camera, projector = camera_device(rig), emitter_device(rig)
-        parts = surfaces_of(scene), camera, projector, media_of(scene), cutouts_of(scene), absorbers_of(scene)
-        return cls(scene, *parts)
+        surfaces = surfaces_of(scene)
+        cutouts = cutouts_of(scene, surfaces)
+        return cls(scene, surfaces, camera, projector, media_of(scene), cutouts, absorbers_of(scene))

@@ -177,9 +177,9 @@ def estimate_cost(
     places : number of places that each pass is traced from, such as the views of a scan.
     beside : cost of the work with the signals; None: that of a run.
     """
-    from rangesim.light_transport.delta_surfaces import has_delta
+    from rangesim.light_transport.delta_surfaces import throws_caustics
 
-    has_caustics = experiment.caustics and has_delta(scene.mitsuba)
+    has_caustics = experiment.caustics and throws_caustics(scene.mitsuba)
     pixels, count = 0, 0
     for rig, instruments in passes:
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # the file of a pass, as it is read for a report

@@ -62,7 +62,6 @@ from rangesim.scene.spectral_reflectance import (
     coloured_materials,
     take_sensor_reflectances,
     warn_of_colours,
-    warn_of_emitters_behind_glass,
 )
 from rangesim.settings.bounds import Bounds, check_number
 
@@ -140,7 +139,6 @@ def load_scene(
     _check(loaded, stated.ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
         warn(f"{label} has {n} sensors, and the first becomes the camera; load_scene(sensor=N) takes another.")
-    warn_of_emitters_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
     working_distance_m = _median_depth(loaded, camera, T_camera)

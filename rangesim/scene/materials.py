@@ -73,11 +73,6 @@ def has_narrow_lobe(bsdf: Any) -> bool:
     return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= MAX_NARROW_ALPHA
 
 
-def is_closed_mask(bsdf: Any) -> bool:
-    """Whether the surface is a `mask` with opacity 1 everywhere, around a BSDF without thin glass."""
-    return bool(bsdf.class_name() == "MaskBSDF" and not _has_thin_glass(bsdf) and _numbers(bsdf).get("opacity") == 1)
-
-
 def holes(bsdf: Any) -> int:
     """Bits of the components of a mitsuba.BSDF that are holes, where light passes as if there were no surface."""
     if not _has(bsdf, "Null"):

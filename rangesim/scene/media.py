@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -63,8 +63,22 @@ def why_not_traced(shape: Any) -> str | None:
     return None
 
 
+class MediumAround(NamedTuple):
+    """The medium in which a place lies: its shape's id, `medium_numbers`, and whether it scatters."""
+
+    body: str
+    numbers: tuple[float, float, float]
+    scatters: bool
+
+
 def body_around(scene: Any, place: np.ndarray) -> str | None:
-    """The id of a shape that is filled with a medium and contains a place (3,), metres; None if there is none.
+    """The id of a shape that is filled with a medium and contains a place (3,), metres; None if there is none."""
+    around = medium_around(scene, place)
+    return None if around is None else around.body
+
+
+def medium_around(scene: Any, place: np.ndarray) -> MediumAround | None:
+    """The medium in which a place (3,), metres, lies; None if there is none. Of nested bodies, any may be chosen.
 
     Rays in several directions count how often they leave and enter each filled shape, judged by its normals. The place
     is inside a shape if most rays leave it more often than they enter it.
@@ -78,7 +92,10 @@ def body_around(scene: Any, place: np.ndarray) -> str | None:
         for count, shape in zip(left, filled, strict=True):
             count += outward * (met == mi.ShapePtr(shape)).numpy()
     inside = (left > 0).sum(axis=1) > len(DIRECTIONS) / 2
-    return next((str(shape.id()) for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
+    shape = next((shape for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
+    if shape is None:
+        return None
+    return MediumAround(str(shape.id()), medium_numbers(shape.interior_medium()), is_boundary(shape))
 
 
 def _crossings(scene: Any, place: np.ndarray, directions: np.ndarray) -> Iterator[tuple[np.ndarray, Any]]:

@@ -17,8 +17,6 @@ import mitsuba as mi
 
 from rangesim.errors import FileFormatError, warn
 from rangesim.files.image_files import is_coloured
-from rangesim.scene.materials import is_closed_mask
-from rangesim.scene.media import is_boundary
 from rangesim.settings.config import shown
 
 REFLECTANCE_KEY = "sensor_reflectance"
@@ -74,28 +72,6 @@ def warn_of_colours(names: list[str], label: str) -> None:
             f"{label}: colours of {len(names)} material{'s' if len(names) > 1 else ''} ({listed}) are read as their "
             f"luminance, but a sensor sees its own wavelength; state {REFLECTANCE_KEY} in the BSDF, or a grey texture."
         )
-
-
-def warn_of_emitters_behind_glass(scene: Any, label: str) -> None:
-    """Warn once if a scene has emitters without extent, and glass or holes: light paths through those miss the
-    emitters."""
-    without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
-    if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_emitters, scene.shapes())):
-        warn(
-            f"{label}: light of directional, point and spot emitters does not pass glass or holes (mask, null) and is "
-            "missing behind it; give the emitter an extent (an area emitter, an envmap)."
-        )
-
-
-def _hides_emitters(shape: Any) -> bool:
-    """Whether light passes the shape (glass, thin glass or holes), but a straight connection to an emitter does not.
-
-    Connections pass boundaries of media (`rangesim.light_transport.scattering`), so these hide nothing.
-    """
-    bsdf = shape.bsdf()
-    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission):
-        return True
-    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_boundary(shape) and not is_closed_mask(bsdf)
 
 
 def _coloured(state: Any) -> Iterator[str]:
