@@ -82,7 +82,7 @@ def test_the_faintest_triangles_are_drawn_by_lot_and_right_on_average() -> None:
 
 def irradiance_of_level(level: float, seed: int) -> tuple[np.ndarray, bool]:
     """Irradiance of points of the square that triangles of a level light, and whether these are faint."""
-    light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, seed)
+    light = SheetScene(sheets_over_a_square(level), PROJECTOR_AT, 16, seed)
     n = 1 << 16
     x, y = np.random.default_rng(0).random((2, n)).astype(np.float32)
     point = mi.Point3f(mi.Float(x - 0.3), mi.Float(y + 0.1), mi.Float(1.0))
@@ -97,7 +97,7 @@ def test_heights_do_not_depend_on_other_triangles() -> None:
     all_of_them = sheets_over_a_square(2e-3)
     per_triangle = ("triangles", "flux", "direct", "shape", "key", "lobe")
     some = all_of_them._replace(**{name: getattr(all_of_them, name)[7:] for name in per_triangle})
-    scenes = [SheetScene(one, PROJECTOR_AT).scene for one in (all_of_them, some)]
+    scenes = [SheetScene(one, PROJECTOR_AT, 16).scene for one in (all_of_them, some)]
     corners = [mi.traverse(one)["light.vertex_positions"].numpy() for one in scenes]
     assert len(np.unique(corners[0][2::3])) > 0.99 * len(corners[0]) // 9  # a height for each
     np.testing.assert_array_equal(corners[0][63:], corners[1])
@@ -107,7 +107,7 @@ def test_heights_do_not_depend_on_other_triangles() -> None:
 @pytest.mark.parametrize(("level", "is_faint"), [(1.0, False), (2e-3, True)])
 def test_light_is_looked_for_wherever_there_is_some(at: list[float], level: float, is_faint: bool) -> None:
     """Directions from any place of the projector, far from the triangles or close to them."""
-    light = SheetScene(sheets_over_a_square(level), np.array(at))
+    light = SheetScene(sheets_over_a_square(level), np.array(at), 16)
     x, y = np.random.default_rng(0).random((2, 1 << 14)).astype(np.float32)
     point = mi.Point3f(mi.Float(x - 0.3), mi.Float(y + 0.1), mi.Float(1.0))
     found = light.may_light(point, mi.Bool(True))

@@ -30,6 +30,8 @@ FLAT_COSINE = 1 - 1e-6
 MAX_UNEVENNESS = 0.05
 """Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
 relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
+MAX_CUBES = 64
+"""Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
 MAX_DIVISIONS = 8
 """Largest number of times that a triangle is divided until it is small as seen from the projector, see
 `lit_directions`: enough for one that is as large as half of the sphere of directions."""
@@ -524,8 +526,44 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
+def crowd_of(position, triangles, shape, area, edge):  # type: ignore[no-untyped-def]
+    """(t,) float64, number of triangles that cover the surface around the middle of each of some triangles.
+
+    It is the area of the triangles in a cube over that of a face. The area of a triangle that is larger than a face is
+    dealt out to the cubes in which it lies. `edge` is that of the cubes in metres.
+    """
+    points = np.minimum(area / (edge * edge), MAX_CUBES).astype(np.int64) + 1
+    table = np.full(1 << int(np.log2(2 * points.sum() + 1) + 1), EMPTY, np.int64)
+    inside, crowd = np.zeros(len(table)), np.empty(len(triangles))
+    for t in range(len(triangles)):
+        for p in range(points[t]):
+            cube = _cube(position, triangles[t], shape[t], p, edge)
+            i = place_in(table, cube)
+            table[i] = cube
+            inside[i] += area[t] / points[t]
+    for t in range(len(triangles)):
+        crowd[t] = inside[place_in(table, _cube(position, triangles[t], shape[t], 0, edge))] / (edge * edge)
+    return crowd
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _cube(position, vertices, shape, point, edge):  # type: ignore[no-untyped-def]
+    """Name of the cube that holds a point of a triangle: its middle, or one of a sequence that fills it."""
+    b1, b2 = 1 / 3, 1 / 3
+    if point > 0:
+        b1, b2 = 0.7548776662466927 * point % 1.0, 0.5698402909980532 * point % 1.0
+        if b1 + b2 > 1:
+            b1, b2 = 1 - b1, 1 - b2
+    name = np.int64(shape)
+    for k in range(3):
+        x = (1 - b1 - b2) * position[vertices[0], k] + b1 * position[vertices[1], k] + b2 * position[vertices[2], k]
+        name = name * np.int64(HASH) + np.int64(np.floor(x / edge))
+    return abs(name)
+
+
+@cached_njit(nogil=True, error_model="numpy")
 def lifted(  # type: ignore[no-untyped-def]
-    sheets, scale, copies, of_lobe, chance, salt, numbers, lift, flat_lift, offsets, middle
+    sheets, scale, copies, is_shared, of_lobe, chance, salt, numbers, lift, flat_lift, offsets, middle
 ):
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
@@ -534,6 +572,7 @@ def lifted(  # type: ignore[no-untyped-def]
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
     copies : (t,) int64, number of groups in which a triangle lies, a power of 2; 0 for bright ones.
+    is_shared : (t,) bool, whether neighbouring pixels share its light.
     of_lobe : (t,) int64, number of the group of a triangle of a narrow lobe that is not faint; 0 for others.
     numbers : groups, every, lobe_groups: numbers of groups of faint triangles, of samples of which one looks for them,
         and of groups of points of narrow lobes.
@@ -548,8 +587,8 @@ def lifted(  # type: ignore[no-untyped-def]
     Returns
     -------
     corners : (3 k, 3) float32, metres. names : (k, 4) uint32, vertices and shape.
-    terms : (k, 3) float32, what the irradiance at the vertices is multiplied by, height over the surface in metres, and
-        1 where the receiver is flat.
+    terms : (k, 4) float32, what the irradiance at the vertices is multiplied by, height over the surface in metres, 1
+        where the receiver is flat, and 1 where neighbouring pixels share the light.
     faint : (k,) bool.
     """
     position, normal, triangles, shape, key, image = sheets
@@ -557,7 +596,7 @@ def lifted(  # type: ignore[no-untyped-def]
     name = _names_of(triangles, key, image)
     most = np.maximum(copies, 1).sum()
     corners, names = np.empty((3 * most, 3), np.float32), np.empty((most, 4), np.uint32)
-    terms, faint, n = np.empty((most, 3), np.float32), np.empty(most, np.bool_), 0
+    terms, faint, n = np.empty((most, 4), np.float32), np.empty(most, np.bool_), 0
     for t in range(len(triangles)):
         step, weight = 0, 1.0
         if copies[t] > 0:
@@ -581,6 +620,7 @@ def lifted(  # type: ignore[no-untyped-def]
                     corners[3 * n + k, axis] = place + (offsets[group, axis] if axis < 2 else 0.0)
             names[n, 3] = shape[t]
             terms[n, 0], terms[n, 1], terms[n, 2] = scale[t] * weight, height, 0.0 if bends else 1.0
+            terms[n, 3] = 1.0 if is_shared[t] else 0.0
             faint[n] = step > 0
             n += 1
     return corners[: 3 * n], names[:n], terms[:n], faint[:n]

@@ -19,7 +19,7 @@ from rangesim.light_transport.beams import BeamDevice
 from rangesim.light_transport.caustic_sheets import CAMERA_CELL, Sheets, trace_sheets
 from rangesim.light_transport.delta_surfaces import throws_caustics
 from rangesim.light_transport.lamps import lamp_sheets
-from rangesim.light_transport.sheet_scene import EVERY, Place, SheetScene
+from rangesim.light_transport.sheet_scene import Place, SheetScene
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -72,13 +72,14 @@ def lamp_caustics(
     return lamp_sheets(traced, CAMERA_CELL * float(np.nanmin(pixels_m)), camera_at, projector_at, settings.seed, report)
 
 
-def sheet_scene(sheets: Sheets | None, rig: Rig, seed: int) -> SheetScene | None:
-    """The triangles as kernels see them; None if there are none. `seed` is that of the pass."""
+def sheet_scene(sheets: Sheets | None, rig: Rig, samples: int, seed: int) -> SheetScene | None:
+    """The triangles as kernels see them; None if there are none. `samples` is the smallest number of a pixel, and
+    `seed` that of the pass."""
     if sheets is None or not len(sheets.flux):
         return None
     # Points of a lens are sharp, so that light has the blur of the pixels alone
     blur_px = None if rig.projector_lens.focus_m is None else 0.0
-    return SheetScene(sheets, rig.T_world_projector[:3, 3], seed, blur_px)
+    return SheetScene(sheets, rig.T_world_projector[:3, 3], samples, seed, blur_px)
 
 
 class Vertex(NamedTuple):
@@ -134,7 +135,7 @@ def caustic_light(
     bright, faint = sheets.may_light(si.p, active & (~is_later | is_turn))
     faint &= is_turn
     looks, way, which = bright | faint, dr.zeros(mi.Float, n), dr.select(bright, mi.UInt32(sheets.first), 1)
-    weight_of_bright = dr.select(is_later, mi.Float(EVERY), 1)
+    weight_of_bright = dr.select(is_later, mi.Float(sheets.every), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
         looks,
@@ -163,7 +164,7 @@ def caustic_light(
             cosine = dr.maximum(dr.abs(light.cosine), dr.abs(lit) / MAX_COSINE_RATIO)
             on_one_side = counts & (seen * lit * si.wi.z * wo.z > 0)  # for both normals, or for neither
             brought = dr.select(on_one_side, vertex.throughput * total * mono(value) / cosine, 0)
-            is_smooth = is_later | (which == 1)
+            is_smooth = is_later | light.is_shared
             sharp += dr.select(is_smooth, 0, brought)
             smooth += dr.select(is_smooth, brought, 0)
             length = vertex.length + light.length

@@ -168,7 +168,7 @@ class _CameraPass:
         settings, rig, guides = self.settings, self.rig, self.guides
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
-        light, ambient = (sheet_scene(one, self.here, settings.seed) for one in (sheets, of_lamps))
+        light, ambient = (sheet_scene(one, self.here, fewest, settings.seed) for one in (sheets, of_lamps))
         view = View(self.traced, light, ambient)
         of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:

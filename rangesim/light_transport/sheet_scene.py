@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.caustic_kernels import irradiance_of, lifted, lit_directions
+from rangesim.light_transport.caustic_kernels import crowd_of, irradiance_of, lifted, lit_directions
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.specular_tree import LOBE_GROUPS
@@ -46,8 +46,14 @@ GROUPS = 4
 """Number of groups of faint triangles, a power of 2. With twice as many groups, a pass of glassware takes as long,
 because there are more copies of triangles."""
 EVERY = 8
-"""Number of samples of which one looks for faint triangles. At 4 a pass of glassware takes 8 % longer and has 5 % less
-noise; at 16 it is 2 % faster and has 12 % more noise."""
+"""Largest number of samples of which one looks for faint triangles. At 4 a pass of glassware takes 8 % longer and has
+5 % less noise; at 16 it is 2 % faster and has 12 % more noise."""
+CROWD = 2.0
+"""Number of faint triangles over a point from which neighbouring pixels share their light. Fewer may show a pattern,
+such as stripes in the reflection of a mirror."""
+CUBES = 64
+"""Number of cubes along the lit part of the scene, in which faint triangles are counted. With fewer cubes, the count of
+a small spot would be that of its surroundings."""
 FAINTEST = 1e-3
 """Ratio of the irradiance to direct light below which faint triangles are drawn by lot, anew for each seed. There are
 many of them, and together they bring a few thousandths of the light."""
@@ -99,6 +105,7 @@ class Light(NamedTuple):
     u, v : Float, projector pixel coordinates.
     length : Float, metres, optical length from the projector.
     cosine : Float, cosine between direction and geometric normal where it landed.
+    is_shared : Bool, whether neighbouring pixels share it.
     """
 
     direction: mi.Vector3f
@@ -106,6 +113,7 @@ class Light(NamedTuple):
     v: mi.Float
     length: mi.Float
     cosine: mi.Float
+    is_shared: mi.Bool
 
 
 class SheetScene:
@@ -115,11 +123,14 @@ class SheetScene:
     ----------
     sheets : Sheets, at least one triangle.
     projector_at : (3,) float, metres, world.
+    samples : int, smallest number of samples of a pixel.
     seed : int, decides which of the faintest triangles are kept.
     blur_px : blur of the light of every triangle, see `rangesim.response.LightPath`.
     """
 
-    def __init__(self, sheets: Sheets, projector_at: np.ndarray, seed: int = 0, blur_px: float | None = None) -> None:
+    def __init__(
+        self, sheets: Sheets, projector_at: np.ndarray, samples: int, seed: int = 0, blur_px: float | None = None
+    ) -> None:
         self.blur_px = None if blur_px is None else mi.Float(blur_px)
         at_vertex, scale, area = irradiance_of(sheets.triangles, sheets.flux, sheets.position, len(sheets.u))
         first = sheets.position[sheets.triangles[:, 0]]
@@ -131,6 +142,7 @@ class SheetScene:
         # Light of a narrow lobe is faint where that of all its points together is
         is_faint = level * np.where(sheets.lobe > 0, max(sheets.lobe.max(), 1), 1) < FAINT
         copies = np.where(is_faint, copies, 0).astype(np.int64)
+        every = 1 << int(np.log2(max(1, min(samples // 2, EVERY))))  # each half of the samples looks once
         group_of_lobe = 1 + GROUPS + (sheets.lobe.astype(np.int64) - 1) % LOBE_GROUPS
         of_lobe = np.where((sheets.lobe > 0) & ~is_faint, group_of_lobe, 0)
         self.has_lobes = bool(of_lobe.any())
@@ -139,6 +151,12 @@ class SheetScene:
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
+        # A faint triangle by itself lies in all groups, so that what it shows is as sharp as in bright light
+        weak = np.flatnonzero(is_faint)
+        crowd = crowd_of(sheets.position, sheets.triangles[weak], sheets.shape[weak], area[weak], size / CUBES)
+        is_shared = np.zeros(len(level), np.bool_)
+        is_shared[weak] = crowd >= CROWD
+        copies[is_faint & ~is_shared] = GROUPS
         copied = 1 + GROUPS + self.has_lobes * LOBE_GROUPS
         across = math.isqrt(copied - 1) + 1  # all of them lie in a square
         places = [[g % across, g // across] for g in range(across**2)]
@@ -149,9 +167,20 @@ class SheetScene:
         flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
-        numbers = GROUPS, EVERY, LOBE_GROUPS
+        numbers = GROUPS, every, LOBE_GROUPS
         corners, names, terms, faint = lifted(
-            columns, scale, copies, of_lobe, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
+            columns,
+            scale,
+            copies,
+            is_shared,
+            of_lobe,
+            chance,
+            salt,
+            numbers,
+            LIFT * distance,
+            flat_lift,
+            offsets,
+            middle,
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
@@ -167,6 +196,7 @@ class SheetScene:
         )
         self.looks, self.names = mi.Float(aligned(looks, np.float32)), mi.UInt32(aligned(names, np.uint32))
         self.terms, self.offsets = mi.Float(aligned(terms, np.float32)), mi.Float(aligned(offsets, np.float32))
+        self.every = dr.opaque(mi.UInt32, every)
         self.projector_at, self.middle = (
             mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in place)) for place in (projector_at, middle)
         )
@@ -184,7 +214,7 @@ class SheetScene:
 
     def is_turn(self, turn: mi.UInt32, which: mi.UInt32) -> mi.Bool:
         """True where it is this turn; each turn comes once in `every` samples."""
-        return turn % EVERY == which % EVERY
+        return turn % self.every == which % self.every
 
     def ray(
         self,
@@ -204,7 +234,7 @@ class SheetScene:
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
         above = MARGIN * (0.5 * LIFT + MAX_SAG) * distance
-        group = dr.select(which == 0, 0, turn // EVERY % GROUPS + 1)
+        group = dr.select(which == 0, 0, turn // self.every % GROUPS + 1)
         if self.has_lobes:
             group = dr.select(which == 2, 1 + GROUPS + lobe_turn % LOBE_GROUPS, group)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
@@ -232,7 +262,7 @@ class SheetScene:
         height, above : metres, height of the triangle over the point, and distance to which rays look.
         """
         names = dr.gather(mi.Vector4u, self.names, found.prim_index, active)
-        terms = dr.gather(mi.Vector3f, self.terms, found.prim_index, active)
+        terms = dr.gather(mi.Vector4f, self.terms, found.prim_index, active)
         # On a flat receiver a triangle is as high as it was lifted; otherwise it lies on another part of the shape
         is_here = active & (names.w == shape) & (dr.abs(height - terms.y) < dr.select(terms.z > 0, FLAT * above, above))
         b1, b2 = found.prim_uv.x, found.prim_uv.y
@@ -254,4 +284,5 @@ class SheetScene:
             first += weight * dr.gather(mi.Vector4f, self.looks, 2 * index, active)
             second += weight * dr.gather(mi.Vector4f, self.looks, 2 * index + 1, active)
         length = first.w + 0.5 * dr.dot(first.xyz, mi.Vector3f(point) - self.projector_at)
-        return Light(dr.normalize(first.xyz), second.x, second.y, length, second.w)
+        is_shared = dr.gather(mi.Float, self.terms, 4 * place.triangle + 3, active) > 0
+        return Light(dr.normalize(first.xyz), second.x, second.y, length, second.w, is_shared)
