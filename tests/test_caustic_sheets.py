@@ -228,6 +228,20 @@ def test_layers_of_one_mesh_that_face_the_same_way_do_not_light_each_other(tmp_p
     assert lit_through_a_pane((0.05, 0.02, 1.0002), (0.05, 0.02, 1.0005), layers=layers).mean() < 0.1 * lit
 
 
+def test_a_cable_behind_a_pane_gets_its_light() -> None:
+    """It is two projector pixels wide and round, so its light is photons, which lie on tangent planes."""
+    cable = {"type": "cylinder", "p0": [3e-3, -0.3, 1.0], "p1": [3e-3, 0.3, 1.0], "radius": 2e-3, "bsdf": matte()}
+    pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 1.0)
+    rig = rig_of(Intrinsics.from_fov(16, 320, 0.5), PROJECTOR, (0, 0, 0), None, (0.1, 0, 0.3), (3e-3, 0, 1))
+    options: dict[str, Any] = {"spp": 16, "max_depth": 2, "glint": False, "indirect": "raw"}
+    free = transport(scene_of(cable=cable), rig, [], **options).energy.direct.sum()
+    behind = [
+        transport(scene_of(cable=cable, pane=pane), rig, [], seed=seed, **options).energy.caustic.sum()
+        for seed in range(3)
+    ]
+    assert np.mean(behind) / free == pytest.approx(0.923, rel=0.07)  # 0.78 where sides are no tangents
+
+
 def test_light_that_comes_by_several_ways_adds_up() -> None:
     """Two mirrors throw light onto the same part of a wall, and none onto each other."""
     mirrors = {

@@ -297,6 +297,22 @@ def test_the_light_of_a_perforated_sheet_is_its_pattern() -> None:
     assert not through.energy.caustic.any()
 
 
+def test_a_picture_in_glass_is_thrown_as_sharply_as_the_projector_s_pixels() -> None:
+    """Fields of three pixels; points of the largest cells are four apart."""
+    cells, half, at, thin = 174, 0.15, 0.2, {**GLASS, "type": "thindielectric"}
+    pattern = {"type": "checkerboard", "color0": 0.2, "color1": 1.0, "to_uv": transform().scale([cells / 2] * 2 + [1])}
+    clear, stained = (
+        before_the_projector(pane=wall(at, bsdf, half, x=0.3)).energy.caustic
+        for bsdf in (thin, {**thin, "specular_transmittance": pattern})
+    )
+    within = np.random.default_rng(0).uniform(-0.5 / CAMERA.fx, 0.5 / CAMERA.fx, (4096, 1, 1, 2))
+    place = (points_on_the_plane(rig_of(CAMERA, PROJECTOR))[..., :2] + within - [0.3, 0.0]) * at + half
+    is_bright = (np.floor(place * cells / (2 * half)).sum(axis=-1) % 2 == 1).mean(axis=0)
+    ratio = stained / clear
+    assert ratio.mean() == pytest.approx(0.6, abs=0.01)
+    assert np.corrcoef(ratio.ravel(), is_bright.ravel())[0, 1] > 0.8  # its edges are a pixel wide
+
+
 def test_light_through_a_hole_and_a_pane_is_that_through_the_pane() -> None:
     pane = wall(0.3, {**GLASS, "type": "thindielectric"}, 0.25, x=0.3)
     hole = wall(0.2, {"type": "mask", "opacity": 0.0, "bsdf": matte()}, 0.15, x=0.3)

@@ -3,6 +3,9 @@
 
 A pass finds it in two ways: a ray of a camera path meets an emitter by chance, or the pass draws a direction towards an
 emitter. Multiple importance sampling gives each way a weight (Veach 1997), so that no light is counted twice.
+
+Rays never meet lamps without extent (sun, point, spot). Straight light of these, also through holes, is found by drawn
+directions alone; `rangesim.light_transport.lamps` has their light beyond glass and mirrors.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import mitsuba as mi
 
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import RayState
+from rangesim.light_transport.surfaces import ray_to_emitter
 from rangesim.light_transport.traced_scene import TracedScene
 
 
@@ -44,14 +48,25 @@ def sampled_ambient(
     si: mi.SurfaceInteraction3f,
     ray_state: RayState,
     xi: mi.Point2f,
+    has_delta_lamps: bool,
     active: mi.Bool,
 ) -> mi.Float:
     """Radiance (W/m2/sr) that the surface `si` reflects from one sampled emitter of the scene, with its weight.
 
-    `ray_state` is the state of the ray that met `si`; `xi` is uniform in the unit square.
+    `ray_state` is the state of the ray that met `si`; `xi` is uniform in the unit square; `has_delta_lamps` says
+    whether the scene has lamps without extent, and surfaces with delta interactions.
     """
-    ds, radiance = traced.scene.sample_emitter_direction(si, xi, True, active)
+    scene, cutouts = traced.scene, traced.cutouts
+    ds, radiance = scene.sample_emitter_direction(si, xi, not has_delta_lamps, active)
     active = active & (ds.pdf != 0)  # `&=` would change the mask of the caller
+    if has_delta_lamps:
+        # Shadow rays to a lamp without extent end right before it, because glass there has triangles of its light
+        ray = dr.select(ds.delta, ray_to_emitter(si, ds.p), si.spawn_ray_to(ds.p))
+        if cutouts is not None and cutouts.exist:
+            radiance *= dr.select(ds.delta, cutouts.transmittance(si, ds.p, active & ds.delta), 1)
+            active &= ds.delta | ~scene.ray_test(ray, coherent=False, active=active & ~ds.delta)
+        else:
+            active &= ~scene.ray_test(ray, coherent=False, active=active)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
     absorbers = traced.absorbers
@@ -68,6 +83,7 @@ def sampled_ambient_through_media(
     ray_state: RayState,
     scatters: mi.Bool,
     xi: mi.Point2f,
+    has_delta_lamps: bool,
     active: mi.Bool,
 ) -> mi.Float:
     """The same as `sampled_ambient`, but also through media that scatter, and also at scattering events inside them.
@@ -89,6 +105,11 @@ def sampled_ambient_through_media(
     value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
     around = None if absorbers is None else absorbers.beyond(si, ds.d, ray_state.sigma_a, active & ~scatters)
     fraction, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
+    if has_delta_lamps:
+        alone, cutouts = active & ds.delta, traced.cutouts
+        holes = cutouts if cutouts is not None and cutouts.exist else None
+        through, _ = media.transmittance(scene, si, ds.p, inside, alone, around, holes, ray_to_emitter)
+        fraction = dr.select(ds.delta, through, fraction)
     weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
     weight = dr.select(ds.delta, 1, weight)
     return dr.select(active, weight * fraction * value * mono(radiance), 0)

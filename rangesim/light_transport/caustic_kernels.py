@@ -27,6 +27,9 @@ MIN_FOOTPRINT = 0.1
 in a focus is not followed any finer."""
 FLAT_COSINE = 1 - 1e-6
 """Cosine between the normals at the corners of a triangle, above which its receiver counts as flat: rounding alone."""
+MAX_UNEVENNESS = 0.05
+"""Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
+relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
 MAX_DIVISIONS = 8
 """Largest number of times that a triangle is divided until it is small as seen from the projector, see
 `lit_directions`: enough for one that is as large as half of the sphere of directions."""
@@ -159,7 +162,7 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
     r : (9,) int64, landings of the points, row by row.
     pixels : edge of the block in pixels. rule : Rule. Faint light only has to land on an even receiver.
     """
-    position, length = landings.position, landings.length
+    position, length, part = landings.position, landings.length, landings.part
     for k in (0, 2, 6, 8):
         if not _is_even(r[k], r[4], landings, rule):
             return False
@@ -169,12 +172,15 @@ def _is_smooth(r, landings, pixels, rule):  # type: ignore[no-untyped-def]
         total += size
         low, high = min(low, size), max(high, size)
     plain = rule.pixel_m + rule.pixel_rad * length[r[4]]
-    off = 0.0
+    off, uneven = 0.0, 0.0
     for m, a, b in ((1, 0, 2), (3, 0, 6), (5, 2, 8), (7, 6, 8), (4, 0, 8), (4, 2, 6)):
         off = max(off, _off_middle(position, r[m], r[a], r[b]))
+        uneven = max(uneven, abs(part[r[m]] - 0.5 * (part[r[a]] + part[r[b]])))
     if _is_faint(r, landings, pixels, rule):
         return np.sqrt(off) < 0.25 * np.sqrt(total)
     footprint = min(max(np.sqrt(total) / pixels, MIN_FOOTPRINT * plain), plain)
+    if uneven > MAX_UNEVENNESS * part[r[4]]:
+        return False
     return high <= MAX_SPREAD * low and np.sqrt(off) <= 4 * rule.tolerance * footprint  # cells are half a block
 
 

@@ -82,6 +82,9 @@ for triangles (`sheet_scene`) reach as far."""
 MAX_SIDE = 0.025
 """Longest side of the parallelogram of a photon, as a fraction of its way from the projector. Light that spreads
 farther does not do so evenly."""
+MAX_TURN = 0.3
+"""Largest angle in radians by which a receiver turns over the parallelogram of a photon. Light on a tangent plane is
+looked for along the normals of the receiver, so a cable that turns by 1.6 would get only 0.7 of its light."""
 HALVINGS = 4
 """Largest number of times that the parallelogram of a photon is halved until all of it lies on the receiver. Light that
 hangs over an edge is lost; with four, it is a sixteenth of what it would be with none."""
@@ -96,6 +99,8 @@ SHIFT_PX = np.array([0.0137, 0.0071])
 BEND = 0.01
 """Difference in radians between the normals at the sides of a photon's parallelogram: enough to tell that its receiver
 may be curved (`sheet_scene`), and too little to change anything else."""
+MIN_SLOPE = 1e-3
+"""Smallest cosine of light to a receiver by which is divided: light that grazes it more lands on the plane anyway."""
 MIN_SIDE_M = 1e-12
 """Smallest length in metres by which another is divided, because light may land in a point."""
 STEP_PX = 0.02
@@ -237,7 +242,7 @@ def trace_sheets(
     if has_throwers(traced.scene):
         cells = CellGrid.of(source.width, source.height, 1.0)
         rays_of = lambda a, b: source.rays(cells.probes(a, b))[0]  # noqa: E731
-        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, lobes=True)
+        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, through_holes=True, lobes=True)
         points = lobe_points(meets.mean() * source.width * source.height, seed)
     tree = SpecularTree(traced, Launches(), points)
     return sheets_of(tree, source, source.at, np.random.default_rng(seed), report)
@@ -347,14 +352,14 @@ class _Tracing:
             tree.traced.scene,
             cells.columns * cells.rows,
             lambda a, b: source.rays(cells.probes(a, b))[0],
-            source.shines_through_holes,
+            through_holes=True,
         )
         if tree.has_lobes:
             meets |= meets_delta(
                 tree.traced.scene,
                 cells.columns * cells.rows,
                 lambda a, b: source.rays(cells.probes(a, b))[0],
-                source.shines_through_holes,
+                through_holes=True,
                 lobes=True,
             )[0]
         meets = (meets & exists).reshape(cells.rows, cells.columns)
@@ -493,10 +498,12 @@ class _Tracing:
         cut = float((lost[::3] * power).sum() / made.flux.sum()) if len(made.flux) else 0.0
         return made._replace(u=u, v=v, cut=cut)
 
-    def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    def _lie_on(self, points: np.ndarray, normal: np.ndarray, shape: np.ndarray, across: np.ndarray) -> np.ndarray:
         """(n,) bool, whether points (n, 3), metres, lie on shapes of these numbers (n,), as far as one looks along
-        their normals (n, 3)."""
-        reach = mi.Float(aligned(MAX_SAG * np.linalg.norm(points - self.at, axis=1), np.float32))
+        their normals (n, 3). `across` is their distance (n,) from the middles of tangent planes, metres."""
+        distance = np.linalg.norm(points - self.at, axis=1)
+        height = np.clip(0.25 * MAX_TURN * across, FLAT * MAX_SAG * distance, MAX_SAG * distance)
+        reach = mi.Float(aligned(height, np.float32))
         p, n = (mi.Vector3f(*(mi.Float(aligned(c, np.float32)) for c in rows.T)) for rows in (points, normal))
         found, here = dr.zeros(mi.Bool, len(points)), mi.UInt32(aligned(shape, np.uint32))
         for side in (n, -n):  # something may stand on the shape
@@ -548,7 +555,7 @@ def _parallelograms(
     place: np.ndarray,
     power: np.ndarray,
     rule: Rule,
-    lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    lie_on: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray],
 ) -> Sheets:
     """Sheets of photons, two triangles each.
 
@@ -573,12 +580,18 @@ def _parallelograms(
         np.where(known[..., None], (found.position[which[:, 1:]] - centre[:, None]) / STEP_PX, plain)
         * edges[:, :, None]
     )
+    # Along the light, a hit on a thin round shape is known to a hundredth of its radius: sides are those of the plane
+    direction = found.direction[this].astype(np.float64)
+    slope = np.einsum("ij,ij->i", direction, normal)
+    slope = np.where(np.abs(slope) > MIN_SLOPE, slope, np.inf)[:, None]
+    sides -= np.einsum("mij,mj->mi", sides, normal)[..., None] * (direction / slope)[:, None]
     longest = MAX_SIDE * found.length[this, None]
     turn = np.linalg.norm(found.normal[which[:, 1:]] - normal[:, None], axis=2) / STEP_PX * edges  # radians over a side
     length = np.maximum(np.linalg.norm(sides, axis=2), MIN_SIDE_M)
     sag = rule.sag * np.linalg.norm(centre - rule.projector_at, axis=1)[:, None]
     flat = np.sqrt(4 * sag / np.maximum(np.where(known, turn, 0) * length, MIN_SIDE_M))  # half for each side
-    shrinks = np.minimum(np.minimum(longest / length, flat), 1)
+    even = MAX_TURN / np.maximum(np.where(known, turn, 0), MIN_SIDE_M)
+    shrinks = np.minimum(np.minimum(np.minimum(longest / length, flat), even), 1)
     sides *= shrinks[..., None]
     ends = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     hangs = np.arange(len(this))
@@ -587,7 +600,8 @@ def _parallelograms(
             break
         corners = (centre[hangs, None] + ends @ sides[hangs]).reshape(-1, 3)
         normals, shapes = (np.repeat(column[this[hangs]], 4, axis=0) for column in (found.normal, found.shape))
-        hangs = hangs[~lie_on(corners, normals, shapes).reshape(-1, 4).all(axis=1)]
+        across = np.linalg.norm(ends @ sides[hangs], axis=2).ravel()
+        hangs = hangs[~lie_on(corners, normals, shapes, across).reshape(-1, 4).all(axis=1)]
         sides[hangs] *= 0.5
         shrinks[hangs] *= 0.5
     corners = centre[:, None] + ends @ sides

@@ -39,7 +39,6 @@ class DeltaSource(ABC):
         pixel_m + pixel_rad * l wide.
     finest_px : pixels, edge of the smallest part of the image that is worth to be told apart.
     fineness : number of parts into which pixels are divided along each axis, because they are coarse.
-    shines_through_holes : whether next-event estimation finds the source's light through holes.
     lens : (k, 2) float, points of the source's lens, as places in the unit square. None: the source is a point.
     lens_weights : (k,) fractions of the light that comes from each of them.
     """
@@ -51,7 +50,6 @@ class DeltaSource(ABC):
     pixel_rad: float
     finest_px: float = 1.0
     fineness: float = 1.0
-    shines_through_holes: bool = False
     lens: np.ndarray | None = None
     lens_weights: tuple[float, ...] = (1.0,)
 
@@ -83,8 +81,6 @@ class ProjectorSource(DeltaSource):
     finest_rad : radians, angle of `finest_px`.
     camera_rad : radians, smallest angle of a camera's pixel; 0: not known.
     """
-
-    shines_through_holes = True
 
     def __init__(self, device: Device, power_w: float, finest_rad: float, camera_rad: float = 0.0) -> None:
         self.device = device

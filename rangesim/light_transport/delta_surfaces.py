@@ -33,7 +33,7 @@ def has_delta(scene: mi.Scene) -> bool:
 def throws_caustics(scene: mi.Scene) -> bool:
     """Whether some surface of a mitsuba.Scene has a delta interaction that is no hole, or scatters into narrow lobes
     alone. Without one there are no caustics."""
-    return any(map(_deflects, scene.shapes())) or has_throwers(scene)
+    return any(map(deflects, scene.shapes())) or has_throwers(scene)
 
 
 def has_throwers(scene: mi.Scene) -> bool:
@@ -51,7 +51,7 @@ def is_delta_surface(shape: mi.Shape) -> bool:
     return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
 
 
-def _deflects(shape: mi.Shape) -> bool:
+def deflects(shape: mi.Shape) -> bool:
     """Whether the surface of a shape has a delta interaction that is no hole; thin glass reflects as well."""
     lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
     return any(mi.has_flag(shape.bsdf().flags(), lobe) for lobe in lobes)
@@ -78,7 +78,7 @@ def meets_delta(
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    counts = is_thrower if lobes else _deflects if through_holes else is_delta_surface
+    counts = is_thrower if lobes else deflects if through_holes else is_delta_surface
     table = mi.Bool(table_of(scene, list(map(counts, scene.shapes()))))
     passed = boundaries_of(scene, through_holes)
     for begin, end in launches.ranges(count):
@@ -107,7 +107,7 @@ def boundaries_of(scene: mi.Scene, and_holes: bool = False) -> mi.Bool | None:
 
     `and_holes` says whether shapes whose only delta interactions are holes count as well.
     """
-    passed = [is_boundary(s) or (and_holes and is_cutout(s.bsdf()) and not _deflects(s)) for s in scene.shapes()]
+    passed = [is_boundary(s) or (and_holes and is_cutout(s.bsdf()) and not deflects(s)) for s in scene.shapes()]
     return mi.Bool(table_of(scene, passed)) if any(passed) else None
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from rangesim.light_transport.camera_rays import PrimaryRay
 from rangesim.light_transport.caustic_sheets import Sheets, apart, joined, sheets_of
 from rangesim.light_transport.delta_sources import DeltaSource
-from rangesim.light_transport.delta_surfaces import boundaries_of, first_shape, is_delta_surface
+from rangesim.light_transport.delta_surfaces import boundaries_of, deflects, first_shape
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.scattering import Medium
@@ -133,13 +133,13 @@ EDGES = np.array([(a, b) for a in range(8) for b in range(a) if np.abs(CORNERS[a
 
 
 def _targets(scene: mi.Scene) -> list[_Target]:
-    """The surfaces of a scene with delta interactions; those of one target differ in size by `SIZES` at most."""
+    """The surfaces of a scene that mirror or refract; those of one target differ in size by `SIZES` at most."""
     shapes = scene.shapes()
-    members = [i for i, shape in enumerate(shapes) if is_delta_surface(shape)]
+    members = [i for i, shape in enumerate(shapes) if deflects(shape)]
     boxes = np.array([[shapes[i].bbox().min, shapes[i].bbox().max] for i in members], np.float64).reshape(-1, 2, 3)
     corners = boxes[:, CORNERS, np.arange(3)]
     size = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0)
-    boundaries, groups = boundaries_of(scene), list[list[int]]()
+    boundaries, groups = boundaries_of(scene, and_holes=True), list[list[int]]()
     for k in np.argsort(size, kind="stable"):
         if not groups or size[k] > SIZES * size[groups[-1][0]]:
             groups.append([])
@@ -206,16 +206,19 @@ def _windows(
     """The rectangles through which a lamp lights a target; none if it does not."""
     if mi.has_flag(lamp.flags(), mi.EmitterFlags.DeltaDirection):
         sample, irradiance = lamp.sample_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0.5), True)
+        strength = float(mono(irradiance)[0])
+        if not strength > 0:
+            return
         axes = _axes(-np.array(sample.d, np.float64).ravel())
         places = target.corners.reshape(-1, 3) @ axes.T
         low, high = places.min(axis=0), places.max(axis=0)
         box = traced.scene.bbox()
-        # In front of all media, which may take light away, and else in front of the target
-        in_front = (
-            target.corners if traced.media is None else np.array([box.min, box.max], np.float64)[CORNERS, range(3)]
-        )
+        everything = np.array([box.min, box.max], np.float64)[CORNERS, range(3)]
+        # In front of all media and holes, which let some light pass, and else in front of the target
+        is_clear = traced.media is None and (traced.cutouts is None or not traced.cutouts.exist)
+        in_front = target.corners if is_clear else everything
         front = float((in_front @ axes[2]).min()) - NEAR * target.size_m
-        make = partial(Sun, traced, target, float(mono(irradiance)[0]), axes, front)
+        make = partial(Sun, traced, target, strength, axes, front)
         yield _Window(low[:2], high[:2], np.inf, finest_m, make)
         return
     at = _place_of(lamp)

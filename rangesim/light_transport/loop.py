@@ -40,6 +40,7 @@ from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light
 from rangesim.light_transport.delta_surfaces import has_delta, has_throwers, is_thrower
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
+from rangesim.light_transport.lamps import lamps_of
 from rangesim.light_transport.sampling import (
     Continued,
     Seed,
@@ -88,6 +89,7 @@ class PathSettings(NamedTuple):
     ambient : whether the scene has light of its own.
     samples_ambient : whether directions to that light are sampled. For uniform surroundings, samples of the BSDF alone
         are best.
+    delta_lamps : whether the scene has lamps without extent, and surfaces with delta interactions.
     refracts : whether light passes through some surface of the scene, so that the refractive index along a path may
         change.
     throws : whether caustics carry the projector's light over narrow lobes to surfaces that scatter it widely.
@@ -100,6 +102,7 @@ class PathSettings(NamedTuple):
     glint: bool
     ambient: bool
     samples_ambient: bool
+    delta_lamps: bool
     refracts: bool
     throws: bool
 
@@ -114,6 +117,7 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
+            delta_lamps=has_delta(scene.mitsuba) and len(lamps_of(scene.mitsuba)) > 0,
             refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
             throws=settings.caustics and has_throwers(scene.mitsuba),
         )
@@ -639,10 +643,10 @@ def walk(
             if dr.hint(settings.samples_ambient, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    light = sampled_ambient(traced, bsdf, si, path.ray_state, xi, is_vertex)
+                    light = sampled_ambient(traced, bsdf, si, path.ray_state, xi, settings.delta_lamps, is_vertex)
                 else:
                     light = sampled_ambient_through_media(
-                        traced, bsdf, si, ray.d, path.ray_state, scatters, xi, is_vertex
+                        traced, bsdf, si, ray.d, path.ray_state, scatters, xi, settings.delta_lamps, is_vertex
                     )
                 radiance.ambient += path.throughput * light
             if dr.hint(of_lamps is not None, mode="scalar"):

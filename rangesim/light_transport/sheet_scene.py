@@ -5,8 +5,12 @@ The triangles are a scene of their own. A short ray along the normal of the surf
 point, one after the other. Triangles that lie in one plane would hide each other, so each of them is lifted off the
 surface by a distance of its own.
 
-Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side. A
-sample of a pixel looks into one group, whose light counts for all. The samples of a pixel look into all groups in turn.
+A table of directions from the projector tells where a search is worth its ray.
+
+Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side.
+One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this
+light (`indirect_filter`). Bright light of narrow lobes is dealt out to groups as well, by the points of the lobes; each
+sample looks into one of them.
 """
 
 from __future__ import annotations
@@ -40,11 +44,11 @@ MARGIN = 1.4
 """Ratio of the height from which a ray looks, and the depth to which it does, to those of the edges of triangles: the
 middle of a triangle is 4 / 3 times as far from a curved surface as its edges."""
 GROUPS = 4
-"""Number of groups of faint triangles; a power of 2. With more groups, samples would find fewer of them at little cost,
-but faint light would be noisier."""
+"""Number of groups of faint triangles, a power of 2. With twice as many groups, a pass of glassware takes as long,
+because there are more copies of triangles."""
 EVERY = 8
-"""Number of samples of which one looks for faint triangles. If every sample looked, a pass would take a fifth
-longer."""
+"""Number of samples of which one looks for faint triangles. At 4 a pass of glassware takes 8 % longer and has 5 % less
+noise; at 16 it is 2 % faster and has 12 % more noise."""
 FAINTEST = 1e-3
 """Ratio of the irradiance to direct light below which faint triangles are drawn by lot, anew for each seed. There are
 many of them, and together they bring a few thousandths of the light."""

@@ -188,7 +188,6 @@ class SpecularTree:
         # All parts share an increment; their states differ
         chance = None if random is None else Continued(mi.PCG32(1))
         self.fewest = dr.opaque(mi.Float, fewest)
-        self.passes_holes = source.shines_through_holes and self.traced.cutouts is not None
         dropped, found = np.zeros(n), []
         launches = (LAUNCHES if random is None else LAUNCHES_OF_PHOTONS) + self.has_lobes
         for left in reversed(range(launches)):
@@ -410,7 +409,7 @@ def _strongest(tree, parts, stored, earlier, numbers):  # type: ignore[no-untype
         o_r, o_t = spawn_specular_ray(si, si.p, d_r).o, spawn_specular_ray(si, si.p, d_t).o
         # Next-event estimation owns the light that went through nothing but holes
         passes = mi.Bool(crosses)
-        if dr.hint(tree.passes_holes, mode="scalar"):
+        if dr.hint(traced.cutouts is not None, mode="scalar"):
             passes |= traced.cutouts.passed(si, bs_t, mirrors)
         chain_r, chain_t = (chain + dr.select(w, mi.UInt32(1), mi.UInt32(0)) for w in (mirrors, mirrors & ~passes))
 
