@@ -243,7 +243,7 @@ def trace_sheets(
     if has_throwers(traced.scene):
         cells = CellGrid.of(source.width, source.height, source.fineness)
         rays_of = lambda a, b: source.rays(cells.probes(a, b))[0]  # noqa: E731
-        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, is_thrower)
+        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, is_thrower, through_holes=True)
         points = lobe_points(meets.mean() * source.width * source.height * source.fineness.prod(), seed)
     tree = SpecularTree(traced, Launches(), points)
     return sheets_of(tree, source, source.at, np.random.default_rng(seed), report)

@@ -33,8 +33,8 @@ class TransportSettings:
     rr_depth : int >= 1, number of surfaces that scatter after which Russian roulette may end a path.
     seed : int, 0 to 2^64 - 1. The same seed gives the same bytes for any number of threads and any memory budget.
     caustics : whether the light of the projector, and of lamps without extent, reaches surfaces through glass and off
-        mirrors (`rangesim.light_transport.caustic_sheets`, `rangesim.light_transport.lamps`). It costs nothing in a
-        scene without glass and mirrors.
+        mirrors (`rangesim.light_transport.caustic_sheets`, `rangesim.light_transport.lamps`), and that of the projector
+        off polished metal. It costs nothing in a scene without these.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and much less
         noise (`rangesim.light_transport.indirect_filter`). "raw": the unbiased sum over each pixel's own paths.
