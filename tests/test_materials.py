@@ -401,10 +401,10 @@ def corner(paint: dict[str, object], turn_deg: float = 0.0, slab: bool = False) 
     )
 
 
-def said_of(scene: rangesim.Scene) -> list[str]:
+def said_of(scene: rangesim.Scene, caustics: bool = False) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        rangesim.transport(scene, scene.rig(), [], spp=1, caustics=False, glint=False)
+        rangesim.transport(scene, scene.rig(), [], spp=1, caustics=caustics, glint=False)
     return [str(warning.message) for warning in caught if "narrow lobes" in str(warning.message)]
 
 
@@ -416,13 +416,13 @@ def test_narrow_lobes_throw_as_much_light_as_the_mirror_they_nearly_are(alpha: f
     )
     rig = mirror.rig()
     mirrored = thrown_w(mirror, rig)
-    thrown = thrown_light(TracedScene.of(rough.mitsuba, rough.in_renderer(rig)))
+    thrown = thrown_light(TracedScene.of(rough.mitsuba, rough.in_renderer(rig)), caustics=False)
     assert thrown is not None
     assert thrown.onto.sum() == pytest.approx(mirrored, rel=0.02)
     assert mirrored > 0.05
     wall, plate = (["wall", "plate"].index(instance.name) for instance in rough.instances)
     assert thrown.onto[wall] == pytest.approx(thrown.by[plate]) == thrown.onto.sum()
-    assert thrown_light(TracedScene.of(mirror.mitsuba, mirror.in_renderer(rig))) is None
+    assert thrown_light(TracedScene.of(mirror.mitsuba, mirror.in_renderer(rig)), caustics=False) is None
 
 
 @pytest.mark.parametrize(
@@ -438,6 +438,15 @@ def test_narrow_lobes_throw_as_much_light_as_the_mirror_they_nearly_are(alpha: f
 def test_light_that_narrow_lobes_throw_is_told(paint: dict[str, object], slab: bool) -> None:
     (said,) = said_of(corner(paint, slab=slab))
     assert "light reaches 'wall' over narrow lobes of 'plate'" in said
+
+
+def test_light_of_polished_metal_is_not_told_if_caustics_carry_it() -> None:
+    polished, painted = (
+        {"type": "roughconductor", "alpha": 0.003},
+        {"type": "principled", "metallic": 1.0, "roughness": 0.05},
+    )
+    assert said_of(corner(polished), caustics=True) == []
+    assert len(said_of(corner(painted), caustics=True)) == 1
 
 
 @pytest.mark.parametrize(

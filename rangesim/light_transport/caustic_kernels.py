@@ -525,7 +525,7 @@ def _names_of(triangles, key, image):  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def lifted(  # type: ignore[no-untyped-def]
-    sheets, scale, copies, chance, salt, groups, every, lift, flat_lift, offsets, middle
+    sheets, scale, copies, of_lobe, chance, salt, numbers, lift, flat_lift, offsets, middle
 ):
     """The triangles of light as a scene of their own, see `sheet_scene`.
 
@@ -534,11 +534,15 @@ def lifted(  # type: ignore[no-untyped-def]
     sheets : Sheets, as a tuple of position, normal, triangles, shape, key, and the bits of u and v of each vertex in a
         number.
     copies : (t,) int64, number of groups in which a triangle lies, a power of 2; 0 for bright ones.
+    of_lobe : (t,) int64, number of the group of a triangle of a narrow lobe that is not faint; 0 for others.
+    numbers : groups, every, lobe_groups: numbers of groups of faint triangles, of samples of which one looks for them,
+        and of groups of points of narrow lobes.
     chance : (t,) float64, probability with which a faint triangle is kept; it then counts for those that are not.
     salt : uint64, a random number of the pass.
     lift, flat_lift : (t,) float64, metres, largest distance of triangles in one place, where the receiver is curved and
         where it is flat.
-    offsets : (groups + 1, 2) float64, metres, of bright triangles and of the groups of faint ones.
+    offsets : (1 + groups + lobe_groups, 2) float64, metres, of bright triangles, of the groups of faint ones, and of
+        those of narrow lobes.
     middle : (3,) float64, metres, the place from which coordinates count.
 
     Returns
@@ -549,6 +553,7 @@ def lifted(  # type: ignore[no-untyped-def]
     faint : (k,) bool.
     """
     position, normal, triangles, shape, key, image = sheets
+    groups, every, lobe_groups = numbers
     name = _names_of(triangles, key, image)
     most = np.maximum(copies, 1).sum()
     corners, names = np.empty((3 * most, 3), np.float32), np.empty((most, 4), np.uint32)
@@ -559,13 +564,15 @@ def lifted(  # type: ignore[no-untyped-def]
             if uniform(np.uint64(name[t]) ^ salt) >= chance[t]:
                 continue
             step, weight = groups // copies[t], groups * every / (copies[t] * chance[t])
+        elif of_lobe[t] > 0:
+            weight = float(lobe_groups)
         if not scale[t] > 0:
             continue
         a, b, c = triangles[t]
         bends = min(_cosine(normal, a, b), _cosine(normal, a, c)) < FLAT_COSINE
         height = (lift if bends else flat_lift)[t] * (uniform(name[t]) - 0.5)
         for copy in range(max(copies[t], 1)):
-            group = 1 + ((key[t] >> 8) + copy * step) % groups if step > 0 else 0
+            group = 1 + ((key[t] >> 8) + copy * step) % groups if step > 0 else of_lobe[t]
             for k in range(3):
                 v = triangles[t, k]
                 names[n, k] = v

@@ -36,10 +36,10 @@ from rangesim.light_transport.caustic_kernels import (
     with_names,
 )
 from rangesim.light_transport.delta_sources import DeltaSource, ProjectorSource
-from rangesim.light_transport.delta_surfaces import meets_delta
+from rangesim.light_transport.delta_surfaces import deflects, has_throwers, is_thrower, meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
-from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree
+from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree, lobe_points
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.materials import is_specular
@@ -73,6 +73,8 @@ lot. If it were smaller, many photons would carry little light."""
 PHOTONS = 1 << 13
 """Number of photons of a pass, as far as cells that are left can be divided into parts of their own. If there are more
 cells than this, each has a photon. With twice as many photons, their noise would be smaller by a third."""
+PHOTONS_WITH_LOBES = 1 << 11
+"""The same in scenes with narrow lobes, which send each photon into many directions."""
 MAX_PARTS = 8
 """Largest number of parts along the edge of a cell that is left; an eighth of a pixel is finer than anything seen."""
 MAX_SAG = 1e-3
@@ -197,6 +199,7 @@ class Sheets(NamedTuple):
     triangles : (t, 3) int64, vertices. flux : (t,) float64, watts.
     direct : (t,) float64, W/m2, irradiance that the source would make there on a surface that faces it.
     shape, key : (t,) uint32, number of the shape where it lands, and name of the chain.
+    lobe : (t,) uint32, number of the point of the narrow lobes that the light met, from 1 on; 0 if it met none.
     cut : ratio of the light that was lost in chains that are too long to all light.
     in_triangles : fraction of the flux that the grid's triangles carry; photons carry the rest.
     """
@@ -213,6 +216,7 @@ class Sheets(NamedTuple):
     direct: np.ndarray
     shape: np.ndarray
     key: np.ndarray
+    lobe: np.ndarray
     cut: float
     in_triangles: float
 
@@ -235,7 +239,14 @@ def trace_sheets(
     """
     assert isinstance(traced.projector, Device)  # beams need no sheets
     source = ProjectorSource(traced.projector, power_w, CAMERA_CELL * pixel_rad, pixel_rad)
-    return sheets_of(SpecularTree(traced, Launches()), source, source.at, np.random.default_rng(seed), report)
+    points = None
+    if has_throwers(traced.scene):
+        cells = CellGrid.of(source.width, source.height, 1.0)
+        rays_of = lambda a, b: source.rays(cells.probes(a, b))[0]  # noqa: E731
+        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, is_thrower)
+        points = lobe_points(meets.mean() * source.width * source.height, seed)
+    tree = SpecularTree(traced, Launches(), points)
+    return sheets_of(tree, source, source.at, np.random.default_rng(seed), report)
 
 
 def sheets_of(
@@ -342,6 +353,7 @@ class _Tracing:
             tree.traced.scene,
             cells.columns * cells.rows,
             lambda a, b: source.rays(cells.probes(a, b))[0],
+            lambda shape: deflects(shape) or (tree.has_lobes and is_thrower(shape)),
             through_holes=True,
         )
         meets = (meets & exists).reshape(cells.rows, cells.columns)
@@ -454,7 +466,8 @@ class _Tracing:
         """
         chance = np.minimum(cells[:, 3] / LEFT, 1)
         # Each cell is divided into parts x parts, each of which may have a photon
-        parts = int(np.clip(np.sqrt(PHOTONS / max(chance.sum(), 1)), 1, MAX_PARTS))
+        photons = PHOTONS_WITH_LOBES if self.tree.has_lobes else PHOTONS
+        parts = int(np.clip(np.sqrt(photons / max(chance.sum(), 1)), 1, MAX_PARTS))
         offset = np.indices((parts, parts)).reshape(2, -1).T / parts
         part = np.tile(offset, (len(cells), 1))
         cells, chance = np.repeat(cells, parts**2, axis=0), np.repeat(chance, parts**2)
@@ -499,8 +512,9 @@ class _Tracing:
     ) -> tuple[Landings, np.ndarray]:
         """Follow the light of points of the image (n, 2), as `SpecularTree.follow`."""
         found, lost = [_no_landings()], [np.empty(0)]
-        for begin in range(0, len(pixels), MAX_AT_ONCE):
-            some = slice(begin, begin + MAX_AT_ONCE)
+        at_once = MAX_AT_ONCE // self.tree.points
+        for begin in range(0, len(pixels), at_once):
+            some = slice(begin, begin + at_once)
             place = mi.Point2f(*(mi.Float(aligned(c, np.float32)) for c in (pixels[some] / self.fineness).T))
             on_lens = None if lens is None else mi.Point2f(*map(float, lens))
             random = None if states is None else mi.UInt64(aligned(states[some], np.uint64))
@@ -514,7 +528,7 @@ class _Tracing:
 def _no_landings() -> Landings:
     """No landing at all."""
     whole, real, vector = np.empty(0, np.uint32), np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    return Landings(whole, whole, whole, real, real, real, real, vector, vector, vector)
+    return Landings(whole, whole, whole, real, real, real, real, vector, vector, vector, whole)
 
 
 def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.ndarray, cut: float) -> Sheets:
@@ -525,7 +539,7 @@ def _sheets(landings: Landings, uv: np.ndarray, triangles: np.ndarray, flux: np.
     slowness = landings.ior[:, None] * landings.direction
     vertices = landings.position, slowness, cosine, landings.length, u, v, landings.normal
     untold = np.full(len(triangles), np.nan)
-    return Sheets(*vertices, triangles, flux, untold, landings.shape[of], landings.key[of], cut, 0.0)
+    return Sheets(*vertices, triangles, flux, untold, landings.shape[of], landings.key[of], landings.lobe[of], cut, 0.0)
 
 
 def _parallelograms(

@@ -105,6 +105,7 @@ def caustic_light(
     channels: list[list[mi.Float]],
     vertex: Vertex,
     turn: mi.UInt32,
+    lobe_turn: mi.UInt32,
     pick: mi.Float,
     is_later: mi.Bool,
     place: mi.UInt32,
@@ -116,6 +117,8 @@ def caustic_light(
     Parameters
     ----------
     turn : UInt32, number that decides which faint triangles the sample looks for; it grows by 1 from sample to sample.
+    lobe_turn : UInt32, number that decides which points of narrow lobes the sample looks for; it grows by 1 from sample
+        to sample.
     pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
@@ -130,19 +133,20 @@ def caustic_light(
     is_turn = sheets.is_turn(turn, dr.select(is_later, mi.UInt32(1), 0))
     bright, faint = sheets.may_light(si.p, active & (~is_later | is_turn))
     faint &= is_turn
-    looks, way, which = bright | faint, dr.zeros(mi.Float, n), dr.select(bright, mi.UInt32(0), 1)
+    looks, way, which = bright | faint, dr.zeros(mi.Float, n), dr.select(bright, mi.UInt32(sheets.first), 1)
     weight_of_bright = dr.select(is_later, mi.Float(EVERY), 1)
     # What the loop only reads is excluded: Dr.Jit traces a loop twice that carries something without changing it
     while dr.hint(
-        looks, exclude=[si, bsdf, vertex, shape, normal, seen, turn, is_later, place, faint, weight_of_bright]
+        looks,
+        exclude=[si, bsdf, vertex, shape, normal, seen, turn, lobe_turn, is_later, place, faint, weight_of_bright],
     ):
         # ---- The next triangle: each bright one counts, and one of the faint ones stands for all of them -----
-        ray, step, above = sheets.ray(si.p, normal, turn, which, way)
+        ray, step, above = sheets.ray(si.p, normal, turn, lobe_turn, which, way)
         found = sheets.next(ray, looks)
         hit = looks & found.is_valid()
         is_new = hit & (found.prim_index != last)
         irradiance, is_here = sheets.irradiance(found, ray.maxt - found.t - above, above, shape, normal, is_new)
-        irradiance *= dr.select(which == 0, weight_of_bright, 1)
+        irradiance *= dr.select(which == 1, 1, weight_of_bright)
         total += irradiance
         fraction = dr.select(is_here, irradiance / total, 0)
         taken = is_here & ((which == 0) | (pick < fraction))
@@ -168,6 +172,11 @@ def caustic_light(
         total = dr.select(counts, 0, total)
         last = dr.select(hit, found.prim_index, last)
         way = dr.select(hit, way + found.t + step, 0)
-        which = dr.select(hit, which, which + 1)
-        looks &= (which == 0) | ((which == 1) & faint)
+        if dr.hint(sheets.has_lobes, mode="scalar"):  # bright light, then lobes, then faint light
+            following = dr.select(which == 0, mi.UInt32(2), dr.select((which == 2) & faint, mi.UInt32(1), 3))
+            which = dr.select(hit, which, following)
+            looks &= which != 3
+        else:
+            which = dr.select(hit, which, which + 1)
+            looks &= (which == 0) | ((which == 1) & faint)
     return channels, sharp, smooth

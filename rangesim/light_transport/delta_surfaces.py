@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces that have delta interactions (glass, mirrors, thin panes, coats, holes), and rays that meet them first."""
+"""Surfaces that send light on instead of scattering it all around, and rays that meet them first.
+
+They have delta interactions (glass, mirrors, thin panes, coats, holes), or scatter into narrow lobes alone (polished
+metal).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ import numpy as np
 from rangesim.light_transport.camera_rays import PrimaryRay
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.surfaces import number_of, table_of
-from rangesim.scene.materials import is_cutout
+from rangesim.scene.materials import is_cutout, is_near_specular
 from rangesim.scene.media import is_boundary
 
 MAX_BOUNDARIES = 8
@@ -27,9 +31,19 @@ def has_delta(scene: mi.Scene) -> bool:
 
 
 def throws_caustics(scene: mi.Scene) -> bool:
-    """Whether some surface of a mitsuba.Scene has a delta interaction that is no hole. Without one there are no
-    caustics."""
-    return any(map(deflects, scene.shapes()))
+    """Whether some surface of a mitsuba.Scene has a delta interaction that is no hole, or scatters into narrow lobes
+    alone. Without one there are no caustics."""
+    return any(map(deflects, scene.shapes())) or has_throwers(scene)
+
+
+def has_throwers(scene: mi.Scene) -> bool:
+    """Whether some surface of a mitsuba.Scene scatters into narrow lobes alone."""
+    return any(map(is_thrower, scene.shapes()))
+
+
+def is_thrower(shape: mi.Shape) -> bool:
+    """Whether the surface of a shape scatters light into narrow lobes alone, which throw it onto other surfaces."""
+    return is_near_specular(shape.bsdf())
 
 
 def is_delta_surface(shape: mi.Shape) -> bool:
@@ -44,22 +58,27 @@ def deflects(shape: mi.Shape) -> bool:
 
 
 def meets_delta(
-    scene: mi.Scene, count: int, rays_of: Callable[[int, int], PrimaryRay], through_holes: bool = False
+    scene: mi.Scene,
+    count: int,
+    rays_of: Callable[[int, int], PrimaryRay],
+    counts: Callable[[mi.Shape], bool] = is_delta_surface,
+    through_holes: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the first surface that each of `count` rays meets, boundaries of media aside, has a delta interaction.
+    """Whether the first surface that each of `count` rays meets, boundaries of media aside, is a delta surface.
 
     Parameters
     ----------
     rays_of : function that returns the rays from one number up to another, such as those through pixels' centres.
+    counts : whether a shape counts, if not delta surfaces do.
     through_holes : whether rays go on through surfaces whose only delta interactions are holes, as boundaries do.
 
     Returns
     -------
-    meets : (count,) bool, whether it has one.
+    meets : (count,) bool, whether the surface counts.
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    table = mi.Bool(table_of(scene, list(map(deflects if through_holes else is_delta_surface, scene.shapes()))))
+    table = mi.Bool(table_of(scene, list(map(counts, scene.shapes()))))
     passed = boundaries_of(scene, through_holes)
     for begin, end in launches.ranges(count):
         rays = rays_of(begin, end)

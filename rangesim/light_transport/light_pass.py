@@ -88,7 +88,7 @@ def trace_light(
     if isinstance(settings.spp, Sampler):
         settings.spp.check(responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
-    warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
+    warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances], settings.caustics)
     views = [_CameraPass(scene, traced, one, settings, number, launches) for number, one in enumerate(rigs)]
     here, at_work = [view.here for view in views], partial(report, 0.0)
     sheets = caustic_sheets(traced, here, settings, at_work)

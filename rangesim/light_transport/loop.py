@@ -38,7 +38,7 @@ from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Vertex, caustic_light
-from rangesim.light_transport.delta_surfaces import has_delta
+from rangesim.light_transport.delta_surfaces import has_delta, has_throwers, is_thrower
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.lamps import lamps_of
 from rangesim.light_transport.sampling import (
@@ -58,6 +58,7 @@ from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.spots import connect_to_spot, lit_spot
 from rangesim.light_transport.strategies import beam_connects, can_be_vertex, is_delta, next_event_kind, owner
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
@@ -91,6 +92,7 @@ class PathSettings(NamedTuple):
     delta_lamps : whether the scene has lamps without extent, and surfaces with delta interactions.
     refracts : whether light passes through some surface of the scene, so that the refractive index along a path may
         change.
+    throws : whether caustics carry the projector's light over narrow lobes to surfaces that scatter it widely.
     """
 
     seed: Seed
@@ -102,6 +104,7 @@ class PathSettings(NamedTuple):
     samples_ambient: bool
     delta_lamps: bool
     refracts: bool
+    throws: bool
 
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
@@ -114,8 +117,9 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
-            delta_lamps=has_delta(scene.mitsuba) and len(lamps_of(scene.mitsuba)) > 0,
+            delta_lamps=len(lamps_of(scene.mitsuba)) > 0 and has_delta(scene.mitsuba),
             refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
+            throws=settings.caustics and has_throwers(scene.mitsuba),
         )
 
 
@@ -207,6 +211,8 @@ class PathState:
     scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
     choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex.
         It is spread evenly over the samples of a pixel. None in scenes without delta interactions.
+    from_wide : Bool, whether the last vertex that is no narrow lobe is on a surface. The light that narrow lobes throw
+        on such a surface is part of caustics. None if no caustics come over narrow lobes.
     spot : Spot of the lane's beam; None for a projector, and in scenes with media.
     pencil : Pencil of the lane's beam around the path; None for a projector, and in scenes without delta interactions.
     """
@@ -225,6 +231,7 @@ class PathState:
     events: mi.UInt32
     scattered_inside: mi.Bool
     choice: mi.Float
+    from_wide: mi.Bool | None = None
     spot: Spot | None = None
     pencil: Pencil | None = None
 
@@ -346,6 +353,8 @@ class Lanes:
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.choice_shift = random_stream(settings.seed, self.pixel, Stream.SECOND).next_uint32()
         self.random = Continued(of_part(rng, self.part))
+        scene = view.traced.scene
+        self.throwers = mi.Bool(table_of(scene, list(map(is_thrower, scene.shapes())))) if settings.throws else None
 
     def number(self, taken: mi.UInt32) -> mi.UInt32:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
@@ -363,6 +372,11 @@ class Lanes:
         decides which faint triangles of light the sample looks for."""
         in_half = ((number >> 2) << 1) + (number & 1)  # pairs of samples belong to the halves in turn
         return in_half + (dr.reinterpret_array(mi.UInt32, self.shift.y) >> 4) % TURNS
+
+    def lobe_turn(self, number: mi.UInt32) -> mi.UInt32:
+        """Number of a sample among all of its pixel, after a start that differs from pixel to pixel; it decides which
+        points of narrow lobes the sample looks for."""
+        return number + (dr.reinterpret_array(mi.UInt32, self.shift.x) >> 4) % TURNS
 
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
@@ -391,6 +405,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
             choice=dr.zeros(mi.Float, n) if settings.delta else None,
+            from_wide=dr.full(mi.Bool, False, n) if settings.throws and not is_beam else None,
             spot=Spot.none(n) if is_beam and not in_media else None,
             pencil=Pencil.none(n) if is_beam and settings.delta else None,
         ),
@@ -430,6 +445,7 @@ def walk(
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
     has_spot, has_pencil = state.path.spot is not None, state.path.pencil is not None
+    throws = state.path.from_wide is not None
     sees_glint, meets_delta = state.radiance.glint is not None, state.path.left_delta is not None
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if has_pencil else mi.RayFlags.All
     left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
@@ -510,6 +526,10 @@ def walk(
         bsdf = si.bsdf(ray)
         is_rough = can_be_vertex(bsdf)
         is_vertex = hit & (path.depth < settings.max_depth) & (scatters | is_rough)
+        gathers = is_vertex
+        if dr.hint(throws, mode="scalar"):
+            is_narrow = dr.gather(mi.Bool, lanes.throwers, number_of(si.shape), at_surface)
+            gathers = is_vertex & ~(is_narrow & path.from_wide)
 
         # ---- The ray meets the emitter of its own beam ------------------------------------------------
         if dr.hint(sees_glint, mode="scalar"):
@@ -534,7 +554,7 @@ def walk(
         tally.last += dr.select(path.depth + 1 == settings.max_depth, arriving, 0)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        is_connected = owner(is_vertex, delta_interactions=0).next_event
+        is_connected = owner(gathers, delta_interactions=0).next_event
         if dr.hint(is_beam, mode="scalar"):
             # The boundaries of media, which nothing bends at, may lie between a mirror and the vertex
             via_delta = path.chain > 0 if settings.delta else mi.Bool(False) if media is None else path.left_delta
@@ -604,10 +624,11 @@ def walk(
                 state.channels,
                 vertex,
                 lanes.turn(number),
+                lanes.lobe_turn(number),
                 lanes.pick(number),
                 is_later,
                 lanes.place,
-                is_vertex & ~scatters,
+                gathers & ~scatters,
             )
             radiance.caustic += sharp
             radiance.smooth_caustic += smooth
@@ -636,6 +657,7 @@ def walk(
                     [],
                     vertex,
                     lanes.turn(number),
+                    lanes.lobe_turn(number),
                     lanes.pick(number),
                     is_later,
                     lanes.place,
@@ -645,6 +667,8 @@ def walk(
 
         # ---- Next direction --------------------------------------------------------------------------
         goes_delta = is_delta(bs)
+        if dr.hint(throws, mode="scalar"):
+            path.from_wide = dr.select(is_narrow | (goes_delta & at_surface), path.from_wide, ~scatters)
         if dr.hint(has_pencil, mode="scalar"):
             assert path.pencil is not None
             bends = goes_delta & at_surface
@@ -710,6 +734,8 @@ def walk(
         path.throughput = dr.select(ends, 1, path.throughput)
         path.ray_state = path.ray_state.reset(traced, ends)
         path.is_first |= ends
+        if dr.hint(throws, mode="scalar"):
+            path.from_wide &= ~ends
         if dr.hint(meets_delta, mode="scalar"):
             path.via_delta &= ~ends
             path.left_delta &= ~ends

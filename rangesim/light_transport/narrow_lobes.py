@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A warning: narrow lobes throw light onto other surfaces, where light paths rarely find it.
 
-A mirror is a delta interaction, and caustics carry its light. A rough metal with an alpha of 0.01 is no delta
-interaction. A polished `principled` BSDF is no delta interaction either, at any roughness. A path from the lit wall
-meets such a lobe by chance once in ten thousand times, and the sampling error does not contain light that no sample
-found. So rays of the projector are followed here, through lobes and delta interactions, to the surfaces that scatter
-them.
+A mirror is a delta interaction, and caustics carry its light, as they carry that of polished metal and glass
+(`roughconductor`, `roughdielectric`). Other narrow lobes are left to paths: those of a polished `principled` BSDF, of
+coats, and all of them if caustics are switched off. A path from the lit wall meets such a lobe by chance once in ten
+thousand times, and the sampling error does not contain light that no sample found. So rays of the projector are
+followed here, through lobes and delta interactions, to the surfaces that scatter them.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from rangesim.errors import warn
 from rangesim.light_transport.beams import BeamDevice
+from rangesim.light_transport.delta_surfaces import is_thrower
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -49,11 +50,13 @@ class ThrownLight(NamedTuple):
     onto: np.ndarray
 
 
-def thrown_light(traced: TracedScene) -> ThrownLight | None:
-    """The light that narrow lobes throw onto other surfaces; None if no surface has such a lobe."""
+def thrown_light(traced: TracedScene, caustics: bool) -> ThrownLight | None:
+    """The light that narrow lobes throw onto other surfaces and that is left to paths; None if no surface has such a
+    lobe. `caustics` says whether caustics carry the light of polished metal and glass."""
     scene, projector = traced.scene, traced.projector
     shapes = scene.shapes()
-    is_narrow = [has_narrow_lobe(shape.bsdf()) for shape in shapes]
+    carries = caustics and not isinstance(projector, BeamDevice)
+    is_narrow = [has_narrow_lobe(shape.bsdf()) and not (carries and is_thrower(shape)) for shape in shapes]
     if not any(is_narrow):
         return None
     narrow_table = mi.Bool(table_of(scene, is_narrow))
@@ -95,16 +98,20 @@ def thrown_light(traced: TracedScene) -> ThrownLight | None:
     return ThrownLight(*(x.numpy()[numbers].astype(np.float64) / lanes for x in (by, onto)))
 
 
-def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
-    """Warn if narrow lobes throw noticeable light onto other surfaces. `names` are those of all shapes."""
-    thrown = thrown_light(traced)
+def warn_of_narrow_lobes(traced: TracedScene, names: list[str], caustics: bool) -> None:
+    """Warn if narrow lobes throw noticeable light onto other surfaces that is left to paths.
+
+    names : those of all shapes. caustics : whether caustics carry the light of polished metal and glass.
+    """
+    thrown = thrown_light(traced, caustics)
     if thrown is None or thrown.onto.sum() <= MIN_THROWN:
         return
     lit, lobes = _named(names, thrown.onto), _named(names, thrown.by)
     warn(
         f"about {thrown.onto.sum():.1%} of the projector's light reaches {lit} over narrow lobes of {lobes}, where "
         f"light paths find little of it: readings there have larger errors than their noise says; make {lobes} smooth "
-        f"(conductor, dielectric) or rougher than alpha {MAX_NARROW_ALPHA:g}."
+        f"(conductor, dielectric) or rougher than alpha {MAX_NARROW_ALPHA:g}, or make them of roughconductor or "
+        "roughdielectric, whose light caustics carry."
     )
 
 

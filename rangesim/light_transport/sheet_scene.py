@@ -8,8 +8,8 @@ surface by a distance of its own.
 A table of directions from the projector tells where a search is worth its ray.
 
 Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side.
-One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this light
-(`indirect_filter`).
+One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this
+light (`indirect_filter`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 from rangesim.light_transport.caustic_kernels import irradiance_of, lifted, lit_directions
 from rangesim.light_transport.caustic_sheets import FAINT, MAX_SAG, Sheets
 from rangesim.light_transport.sampling import aligned
+from rangesim.light_transport.specular_tree import LOBE_GROUPS
 
 LIFT = 4e-4
 """Largest distance between two triangles in one place, as a fraction of their distance from the projector: a thousand
@@ -127,21 +128,30 @@ class SheetScene:
             level = sheets.flux / area / sheets.direct
             # A faint triangle lies in more groups the brighter it is, so that each one found brings about as much
             copies = np.clip(2 ** np.ceil(np.log2(GROUPS * level / FAINT)), 1, GROUPS)
-        copies = np.where(level < FAINT, copies, 0).astype(np.int64)
+        # Light of a narrow lobe is faint where that of all its points together is
+        is_faint = level * np.where(sheets.lobe > 0, max(sheets.lobe.max(), 1), 1) < FAINT
+        copies = np.where(is_faint, copies, 0).astype(np.int64)
+        group_of_lobe = 1 + GROUPS + (sheets.lobe.astype(np.int64) - 1) % LOBE_GROUPS
+        of_lobe = np.where((sheets.lobe > 0) & ~is_faint, group_of_lobe, 0)
+        self.has_lobes = bool(of_lobe.any())
+        # What samples look for first where there is bright light, as `which` of `ray`
+        self.first = 2 if self.has_lobes and (copies[of_lobe == 0] > 0).all() else 0
 
         low, high = sheets.position.min(axis=0), sheets.position.max(axis=0)
         size, middle = float((high - low).max()) + MIN_SIZE_M, (0.5 * (low + high)).astype(np.float64)
-        across = math.isqrt(GROUPS) + 1  # all of them lie in a square
+        copied = 1 + GROUPS + self.has_lobes * LOBE_GROUPS
+        across = math.isqrt(copied - 1) + 1  # all of them lie in a square
         places = [[g % across, g // across] for g in range(across**2)]
         places = sorted(places, key=lambda place: np.hypot(*(np.array(place) - across // 2)))
-        offsets = (np.array(places[: GROUPS + 1]) - across // 2) * (SPACING * size)  # bright ones in the middle
+        offsets = (np.array(places[:copied]) - across // 2) * (SPACING * size)  # bright ones in the middle
         image = np.column_stack([sheets.u, sheets.v]).view(np.uint64)[:, 0]
         columns = (sheets.position, sheets.normal, sheets.triangles, sheets.shape, sheets.key, image)
         flat_lift = (LIFT + 2 * MAX_SAG) * distance  # a flat receiver leaves room that a curved one takes
         chance = np.minimum(level / FAINTEST, 1)
         salt = np.random.default_rng(seed).integers(1 << 63, dtype=np.uint64)
+        numbers = GROUPS, EVERY, LOBE_GROUPS
         corners, names, terms, faint = lifted(
-            columns, scale, copies, chance, salt, GROUPS, EVERY, LIFT * distance, flat_lift, offsets, middle
+            columns, scale, copies, of_lobe, chance, salt, numbers, LIFT * distance, flat_lift, offsets, middle
         )
         mesh = mi.Mesh("light", len(corners), len(names))
         parameters = mi.traverse(mesh)
@@ -181,6 +191,7 @@ class SheetScene:
         point: mi.Point3f,
         normal: mi.Normal3f,
         turn: mi.UInt32,
+        lobe_turn: mi.UInt32,
         which: mi.UInt32,
         way: mi.Float,
     ) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
@@ -188,11 +199,14 @@ class SheetScene:
         metres from a triangle that it meets to where the next one is looked for; and the distance from the point to
         which rays look, in metres.
 
-        which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is.
+        which : UInt32; 0: through bright triangles, 1: through those of the group of faint ones whose turn it is, 2:
+            through those of the group of points of narrow lobes whose turn it is.
         """
         distance = dr.norm(mi.Vector3f(point) - self.projector_at)
         above = MARGIN * (0.5 * LIFT + MAX_SAG) * distance
         group = dr.select(which == 0, 0, turn // EVERY % GROUPS + 1)
+        if self.has_lobes:
+            group = dr.select(which == 2, 1 + GROUPS + lobe_turn % LOBE_GROUPS, group)
         offset = dr.gather(mi.Vector2f, self.offsets, group)
         place = mi.Point3f(point) - self.middle + mi.Vector3f(offset.x, offset.y, 0)
         ray = mi.Ray3f(place + mi.Vector3f(normal) * (above - way), -mi.Vector3f(normal))

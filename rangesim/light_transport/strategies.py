@@ -5,6 +5,11 @@ A vertex of a light path is a surface point where light scatters into many direc
 medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats),
 which send it on in single directions. Holes send it on as if nothing were there, so a segment may go through them.
 
+Metal and glass of a small roughness are in between: they scatter light into narrow lobes, which light paths find by
+chance only where they come from there. Such lobes count as vertices for a camera path that comes to them from the
+camera, by delta interactions and narrow lobes alone. Where a camera path comes to them from a wider vertex, they count
+as delta interactions (`PathState.from_wide` in `loop.py`).
+
 Three strategies bring the projector's light to the camera. They partition all light paths: each path belongs to one of
 them, so that no light is counted twice and none is left out. `owner` says which strategy a path belongs to.
 """
@@ -37,8 +42,9 @@ def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
     | --------------------- | -------------------------------------------------- | --------------------------- |
     | next-event estimation | a straight segment leads from the projector to a   | direct, specular, multipath |
     |                       | vertex                                             |                             |
-    | caustics              | delta interactions lie between the projector and   | caustic                     |
-    |                       | the vertex next to it                              |                             |
+    | caustics              | delta interactions, or narrow lobes before a wider | caustic                     |
+    |                       | vertex, lie between the projector and the vertex   |                             |
+    |                       | next to it                                         |                             |
     | glint                 | no vertex at all: the camera sees the projector's  | glint                       |
     |                       | lens, directly or by delta interactions            |                             |
 

@@ -29,6 +29,14 @@ MAX_NARROW_ALPHA = 0.03
 at most a five-hundredth of a hemisphere, so a light path in a random direction hardly ever lies in the lobe. A larger
 value would also count lobes that such paths do find."""
 
+MAX_NEAR_SPECULAR_ALPHA = 0.1
+"""Largest microfacet roughness alpha, dimensionless, of a metal or glass whose lobes are followed as specular chains
+are. Paths find the light that wider lobes throw on a matte wall beside them: at 16 samples its noise is 3.5 % of all
+light at 0.1, and 8, 28 and 43 % at 0.05, 0.02 and 0.01."""
+NEAR_SPECULAR_BSDFS = ("RoughConductor", "RoughDielectric", "TwoSidedBRDF")
+"""Class names of BSDFs that scatter into a reflected and a transmitted lobe alone, each of which can be sampled on its
+own; wrappers of them that change nothing else."""
+
 ALL_COMPONENTS = 0xFFFFFFFF
 """Mask of all components of a BSDF, as in `mitsuba.BSDFContext`."""
 
@@ -71,6 +79,20 @@ def has_narrow_lobe(bsdf: Any) -> bool:
     """Whether a mitsuba.BSDF has lobes almost as narrow as those of a mirror, but not delta distributions."""
     alphas = _alphas(_numbers(bsdf))
     return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= MAX_NARROW_ALPHA
+
+
+def is_near_specular(bsdf: Any) -> bool:
+    """Whether a mitsuba.BSDF scatters into lobes alone that are nearly as narrow as those of a mirror or of glass."""
+    if not _has(bsdf, "GlossyReflection", "GlossyTransmission") or _has(bsdf, "Diffuse", "Delta", "Null"):
+        return False
+    parts = mi.traverse(bsdf).hierarchy
+    names = {part.class_name() for part in parts if isinstance(part, mi.BSDF)}
+    alphas = np.array(_alphas(_numbers(bsdf)), np.float32)
+    return (
+        names <= set(NEAR_SPECULAR_BSDFS)
+        and len(alphas) > 0
+        and bool((alphas <= np.float32(MAX_NEAR_SPECULAR_ALPHA)).all())
+    )
 
 
 def holes(bsdf: Any) -> int:
