@@ -55,7 +55,7 @@ CAMERA_CELL = 0.5
 is finer."""
 TOLERANCE_PX = 0.04
 """Largest error of the place of a triangle, in pixels of the projector. With 0.15 the middle of the light of a ball was
-1.1 % too dim; with 0.04 it is 0.8 % too dim, and glassware has a tenth more triangles and takes as long to trace."""
+1.1 % too dim; with 0.04 it is 0.4 % too dim, and glassware has a tenth more triangles and takes as long to trace."""
 FAINT = 0.05
 """Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
 each sample sees one group of faint triangles alone."""
