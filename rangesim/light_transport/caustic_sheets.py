@@ -36,7 +36,7 @@ from rangesim.light_transport.caustic_kernels import (
     with_names,
 )
 from rangesim.light_transport.delta_sources import DeltaSource, ProjectorSource
-from rangesim.light_transport.delta_surfaces import has_throwers, meets_delta
+from rangesim.light_transport.delta_surfaces import deflects, has_throwers, is_thrower, meets_delta
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.specular_tree import HASH_STEP, Landings, SpecularTree, lobe_points
@@ -242,7 +242,7 @@ def trace_sheets(
     if has_throwers(traced.scene):
         cells = CellGrid.of(source.width, source.height, 1.0)
         rays_of = lambda a, b: source.rays(cells.probes(a, b))[0]  # noqa: E731
-        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, through_holes=True, lobes=True)
+        meets, _ = meets_delta(traced.scene, cells.columns * cells.rows, rays_of, is_thrower)
         points = lobe_points(meets.mean() * source.width * source.height, seed)
     tree = SpecularTree(traced, Launches(), points)
     return sheets_of(tree, source, source.at, np.random.default_rng(seed), report)
@@ -352,16 +352,9 @@ class _Tracing:
             tree.traced.scene,
             cells.columns * cells.rows,
             lambda a, b: source.rays(cells.probes(a, b))[0],
+            lambda shape: deflects(shape) or (tree.has_lobes and is_thrower(shape)),
             through_holes=True,
         )
-        if tree.has_lobes:
-            meets |= meets_delta(
-                tree.traced.scene,
-                cells.columns * cells.rows,
-                lambda a, b: source.rays(cells.probes(a, b))[0],
-                through_holes=True,
-                lobes=True,
-            )[0]
         meets = (meets & exists).reshape(cells.rows, cells.columns)
         self.delta = _Delta(meets, 2 * self.coarsest * np.array(self.blocks))
 

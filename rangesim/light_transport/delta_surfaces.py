@@ -61,24 +61,23 @@ def meets_delta(
     scene: mi.Scene,
     count: int,
     rays_of: Callable[[int, int], PrimaryRay],
+    counts: Callable[[mi.Shape], bool] = is_delta_surface,
     through_holes: bool = False,
-    lobes: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the first surface that each of `count` rays meets, boundaries of media aside, has a delta interaction.
+    """Whether the first surface that each of `count` rays meets, boundaries of media aside, is a delta surface.
 
     Parameters
     ----------
     rays_of : function that returns the rays from one number up to another, such as those through pixels' centres.
+    counts : whether a shape counts, if not delta surfaces do.
     through_holes : whether rays go on through surfaces whose only delta interactions are holes, as boundaries do.
-    lobes : whether narrow lobes count instead of delta interactions.
 
     Returns
     -------
-    meets : (count,) bool, whether it has one.
+    meets : (count,) bool, whether the surface counts.
     exists : (count,) bool, whether the lens sends such a ray at all.
     """
     launches, meets, exists = Launches(), np.zeros(count, dtype=bool), np.ones(count, dtype=bool)
-    counts = is_thrower if lobes else deflects if through_holes else is_delta_surface
     table = mi.Bool(table_of(scene, list(map(counts, scene.shapes()))))
     passed = boundaries_of(scene, through_holes)
     for begin, end in launches.ranges(count):

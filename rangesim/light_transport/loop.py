@@ -117,7 +117,7 @@ class PathSettings(NamedTuple):
             glint=settings.glint,
             ambient=scene.has_ambient,
             samples_ambient=scene.has_lamps,
-            delta_lamps=has_delta(scene.mitsuba) and len(lamps_of(scene.mitsuba)) > 0,
+            delta_lamps=len(lamps_of(scene.mitsuba)) > 0 and has_delta(scene.mitsuba),
             refracts=any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in scene.mitsuba.shapes()),
             throws=settings.caustics and has_throwers(scene.mitsuba),
         )

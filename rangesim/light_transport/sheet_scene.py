@@ -9,8 +9,7 @@ A table of directions from the projector tells where a search is worth its ray.
 
 Faint triangles are many and bring little. They are dealt out to groups, in copies of the scene that lie side by side.
 One sample of a pixel in a few looks into one group, whose light counts for all, and neighbouring pixels share this
-light (`indirect_filter`). Bright light of narrow lobes is dealt out to groups as well, by the points of the lobes; each
-sample looks into one of them.
+light (`indirect_filter`).
 """
 
 from __future__ import annotations
