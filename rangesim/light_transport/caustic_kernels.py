@@ -30,8 +30,9 @@ FLAT_COSINE = 1 - 1e-6
 MAX_UNEVENNESS = 0.05
 """Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
 relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
-MAX_CUBES = 64
-"""Largest number of cubes to which the area of a triangle is dealt out, see `crowd_of`. Larger triangles are rare."""
+POINTS, MAX_POINTS = 8, 512
+"""Numbers of points among which the area of a triangle is dealt out, see `crowd_of`: for the face of a cube, so that
+the count is right within a third, and largest number. Larger triangles are rare."""
 MAX_DIVISIONS = 8
 """Largest number of times that a triangle is divided until it is small as seen from the projector, see
 `lit_directions`: enough for one that is as large as half of the sphere of directions."""
@@ -532,7 +533,7 @@ def crowd_of(position, triangles, shape, area, edge):  # type: ignore[no-untyped
     It is the area of the triangles in a cube over that of a face. The area of a triangle that is larger than a face is
     dealt out to the cubes in which it lies. `edge` is that of the cubes in metres.
     """
-    points = np.minimum(area / (edge * edge), MAX_CUBES).astype(np.int64) + 1
+    points = np.minimum(POINTS * area / (edge * edge), MAX_POINTS).astype(np.int64) + 1
     table = np.full(1 << int(np.log2(2 * points.sum() + 1) + 1), EMPTY, np.int64)
     inside, crowd = np.zeros(len(table)), np.empty(len(triangles))
     for t in range(len(triangles)):

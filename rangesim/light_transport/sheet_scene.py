@@ -49,7 +49,7 @@ because there are more copies of triangles."""
 EVERY = 8
 """Largest number of samples of which one looks for faint triangles. At 4 a pass of glassware takes 8 % longer and has
 5 % less noise; at 16 it is 2 % faster and has 12 % more noise."""
-CROWD = 2.0
+CROWD = 2.5
 """Number of faint triangles over a point from which neighbouring pixels share their light. Fewer may show a pattern,
 such as stripes in the reflection of a mirror."""
 CUBES = 64
