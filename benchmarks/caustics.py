@@ -53,7 +53,7 @@ def triangle_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[Any, n
     traced = TracedScene.of(scene.mitsuba, here)
     for seed in range(repeats + 1):
         sheets, tracing = timed(partial(caustic_sheets, traced, [here], TransportSettings(seed=seed)))
-        _, building = timed(partial(sheet_scene, sheets, here, spp))
+        _, building = timed(partial(sheet_scene, sheets, here, spp, 0))
         seconds.append([tracing[0], building[0]])
     return sheets, np.array(seconds[1:])
 
