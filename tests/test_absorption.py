@@ -188,7 +188,7 @@ def test_the_lens_seen_through_slabs_is_weakened_by_each(slabs: int) -> None:
     rig = rig_of(close_up, PROJECTOR, (0.0, 0.0, 1.5), looks_at=(0.0, 0.0, 0.0))
     panes = [slab(near, near + D) for near in (0.3, 0.8)[:slabs]]
     clear, dim = (
-        transport(scene_of(**{f"pane_{i}": filled(pane, a) for i, pane in enumerate(panes)}), rig, [], spp=1, seed=2)
+        transport(scene_of(**{f"pane_{i}": filled(pane, a) for i, pane in enumerate(panes)}), rig, [], spp=8, seed=2)
         for a in (0.0, SIGMA_A)
     )
     assert dim.energy.glint.sum() / clear.energy.glint.sum() == pytest.approx(np.exp(-slabs * SIGMA_A * D), rel=0.01)
