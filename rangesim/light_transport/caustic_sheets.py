@@ -58,7 +58,7 @@ TOLERANCE_PX = 0.04
 1.1 % too dim; with 0.04 it is 0.4 % too dim, and glassware has a tenth more triangles and takes as long to trace."""
 FAINT = 0.05
 """Ratio of the irradiance to direct light below which a triangle is faint. Blocks are not divided for faint light, and
-each sample sees one group of faint triangles alone."""
+one sample of a few looks for it."""
 SIGNIFICANT = 0.05
 """Fraction of the light of a block whose chains are not smooth, above which it is divided."""
 FEWEST = 0.01

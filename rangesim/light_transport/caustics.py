@@ -112,8 +112,10 @@ def caustic_light(
     place: mi.UInt32,
     active: mi.Bool,
 ) -> tuple[list[list[mi.Float]], mi.Float, mi.Float]:
-    """Add the light of all triangles that cover a vertex; returns the channels and the radiance (W/m2/sr) at the
-    camera.
+    """Add the light of all triangles that cover a vertex.
+
+    Returns the channels, and the radiance (W/m2/sr) at the camera of light that is the pixel's own, and of light that
+    neighbouring pixels share.
 
     Parameters
     ----------
