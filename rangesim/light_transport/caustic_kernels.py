@@ -30,9 +30,11 @@ FLAT_COSINE = 1 - 1e-6
 MAX_UNEVENNESS = 0.05
 """Largest difference between the fraction of the light that is left in the middle of a line and its mean at the ends,
 relative to it, within a block, so that a picture in coloured glass is as sharp as pixels."""
-POINTS, MAX_POINTS = 8, 512
-"""Numbers of points among which the area of a triangle is dealt out, see `crowd_of`: for the face of a cube, so that
-the count is right within a third, and largest number. Larger triangles are rare."""
+POINTS = 8
+"""Number of points among which the area of a triangle as large as the face of a cube is dealt out, see `crowd_of`, so
+that the count is right within a third."""
+MAX_POINTS = 512
+"""Largest number of these points for a triangle, so that a few large triangles do not take most of the time."""
 MAX_DIVISIONS = 8
 """Largest number of times that a triangle is divided until it is small as seen from the projector, see
 `lit_directions`: enough for one that is as large as half of the sphere of directions."""
@@ -629,7 +631,7 @@ def lifted(  # type: ignore[no-untyped-def]
 
 @cached_njit(nogil=True, error_model="numpy")
 def lit_directions(position, triangles, is_faint, cubes, reach):  # type: ignore[no-untyped-def]
-    """Which directions from the origin lead to triangles, as words of 16 cubes with two bits each (uint32).
+    """The directions from the origin that lead to triangles, as words of 16 cubes with two bits each (uint32).
 
     The unit vectors lie in a cube of edge 2, which is divided into `cubes` along each edge. The lower bit of a cube
     stands for bright triangles, the upper one for faint ones.

@@ -99,15 +99,26 @@ class Vertex(NamedTuple):
     is_first: mi.Bool
 
 
+class Draws(NamedTuple):
+    """The numbers of a sample that decide which triangles it looks for.
+
+    turn : UInt32, decides about faint triangles; it grows by 1 from sample to sample of a half of the pixel.
+    lobe_turn : UInt32, decides about points of narrow lobes; it grows by 1 from sample to sample.
+    pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
+    """
+
+    turn: mi.UInt32
+    lobe_turn: mi.UInt32
+    pick: mi.Float
+
+
 @dr.syntax
 def caustic_light(
     sheets: SheetScene,
     accumulators: Accumulators,
     channels: list[list[mi.Float]],
     vertex: Vertex,
-    turn: mi.UInt32,
-    lobe_turn: mi.UInt32,
-    pick: mi.Float,
+    draws: Draws,
     is_later: mi.Bool,
     place: mi.UInt32,
     active: mi.Bool,
@@ -119,15 +130,12 @@ def caustic_light(
 
     Parameters
     ----------
-    turn : UInt32, number that decides which faint triangles the sample looks for; it grows by 1 from sample to sample.
-    lobe_turn : UInt32, number that decides which points of narrow lobes the sample looks for; it grows by 1 from sample
-        to sample.
-    pick : Float, uniform number in 0..1 that chooses one of the faint triangles.
     is_later : Bool, whether the vertex is not the first of its path.
     place : UInt32, index of the lane's pixel among those of the accumulators.
     """
     n = dr.width(place)
     si, bsdf = vertex.si, vertex.bsdf
+    turn, lobe_turn, pick = draws
     shape, normal = number_of(si.shape), mi.Normal3f(si.n)
     seen = dr.dot(si.to_world(si.wi), si.n)
     sharp, smooth = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)

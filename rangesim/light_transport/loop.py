@@ -37,7 +37,7 @@ import numpy as np
 from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
-from rangesim.light_transport.caustics import Vertex, caustic_light
+from rangesim.light_transport.caustics import Draws, Vertex, caustic_light
 from rangesim.light_transport.delta_surfaces import has_delta, has_throwers, is_thrower
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.lamps import lamps_of
@@ -74,7 +74,7 @@ ITERATIONS_PER_SAMPLE = 2
 only the size of the first launch depends on it; the size of later ones depends on the count."""
 
 TURNS = 1 << 16
-"""Number of different starts in the order in which pixels look for faint triangles; any large number would do."""
+"""Number of different starts in the order in which pixels look for triangles; any large number would do."""
 
 Array = TypeVar("Array")
 
@@ -360,23 +360,15 @@ class Lanes:
         """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
-    def pick(self, number: mi.UInt32) -> mi.Float:
-        """A uniform number in 0..1 for a sample of this number, apart from the random numbers of its path.
+    def draws(self, number: mi.UInt32) -> Draws:
+        """The numbers that decide which triangles of light a sample of this number looks for.
 
-        It depends on the pixel and the seed, as the shift does.
+        They depend on the pixel and the seed, as the shift does, and not on the random numbers of the path.
         """
-        return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, self.shift.x), number)
-
-    def turn(self, number: mi.UInt32) -> mi.UInt32:
-        """Number of a sample among those of its half of the pixel, after a start that differs from pixel to pixel; it
-        decides which faint triangles of light the sample looks for."""
+        x, y = (dr.reinterpret_array(mi.UInt32, of_axis) for of_axis in self.shift)
         in_half = ((number >> 2) << 1) + (number & 1)  # pairs of samples belong to the halves in turn
-        return in_half + (dr.reinterpret_array(mi.UInt32, self.shift.y) >> 4) % TURNS
-
-    def lobe_turn(self, number: mi.UInt32) -> mi.UInt32:
-        """Number of a sample among all of its pixel, after a start that differs from pixel to pixel; it decides which
-        points of narrow lobes the sample looks for."""
-        return number + (dr.reinterpret_array(mi.UInt32, self.shift.x) >> 4) % TURNS
+        turn, lobe_turn = in_half + (y >> 4) % TURNS, number + (x >> 4) % TURNS
+        return Draws(turn, lobe_turn, mi.sample_tea_float32(x, number))
 
 
 def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
@@ -623,9 +615,7 @@ def walk(
                 accumulators,
                 state.channels,
                 vertex,
-                lanes.turn(number),
-                lanes.lobe_turn(number),
-                lanes.pick(number),
+                lanes.draws(number),
                 is_later,
                 lanes.place,
                 gathers & ~scatters,
@@ -656,9 +646,7 @@ def walk(
                     nothing,
                     [],
                     vertex,
-                    lanes.turn(number),
-                    lanes.lobe_turn(number),
-                    lanes.pick(number),
+                    lanes.draws(number),
                     is_later,
                     lanes.place,
                     is_vertex & ~scatters,

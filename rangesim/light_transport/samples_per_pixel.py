@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many samples each pixel takes, decided by the first samples of a pass.
+"""The numbers of samples that pixels take, decided by the first samples of a pass.
 
 A `Sampler` decides by what is measured. `samples_for_caustics` adds samples where caustics are uneven within a pixel.
 """
