@@ -20,6 +20,9 @@ from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.materials import is_cutout, is_near_specular
 from rangesim.scene.media import is_boundary
 
+CLEAR_GLASS = ("SmoothDielectric", "ThinDielectric")
+"""Class names of BSDFs that reflect light or let it pass, and do nothing else. Wrappers and blends of them choose among
+more lobes, or do not tell the probability of their choice."""
 MAX_BOUNDARIES = 8
 """Number of boundaries of media in a row behind which glass is looked for, so that the time is bounded. Glass behind
 more of them, such as in the fifth of five bodies of milk, throws no caustics."""
@@ -55,6 +58,12 @@ def deflects(shape: mi.Shape) -> bool:
     """Whether the surface of a shape has a delta interaction that is no hole; thin glass reflects as well."""
     lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
     return any(mi.has_flag(shape.bsdf().flags(), lobe) for lobe in lobes)
+
+
+def splits_light(shape: mi.Shape) -> bool:
+    """Whether light that meets the surface of a shape takes one of two ways, with probabilities that a BSDF sample
+    tells exactly: off clear glass or through it."""
+    return shape.bsdf().class_name() in CLEAR_GLASS and not is_boundary(shape)
 
 
 def meets_delta(

@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.chain_strata import CERTAIN, MAX_BRANCHES
+from rangesim.light_transport.delta_surfaces import splits_light
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN
 from rangesim.light_transport.strategies import delta_only
@@ -29,11 +31,14 @@ class Scatterer:
     index : Int32, index of its shape; -1 where there is none.
     chain : UInt32, number that stands for the surfaces of the main chain and for the way taken at each; 0 where there
         is no chain.
+    branches : UInt32, number of surfaces of the main chain, up to `MAX_BRANCHES`, at which samples leave it: those of
+        clear glass where light takes both ways.
     """
 
     si: mi.SurfaceInteraction3f
     index: mi.Int32
     chain: mi.UInt32
+    branches: mi.UInt32
 
 
 class FirstScatterers:
@@ -48,9 +53,11 @@ class FirstScatterers:
     def __init__(self, scene: mi.Scene, surfaces: mi.Scene | Surfaces) -> None:
         shapes, self.scene, self.surfaces = scene.shapes(), scene, surfaces
         matte, specular = [is_matte(s) for s in shapes], [is_specular(s) for s in shapes]
-        self.has_chains = any(specular)
+        splits = list(map(splits_light, shapes))
+        self.has_chains, self.has_branches = any(specular), any(splits)
         self.index_of = mi.Int32(table_of(scene, np.arange(len(shapes), dtype=np.int32)))
-        self.matte_of, self.specular_of = (mi.Bool(table_of(scene, of)) for of in (matte, specular))
+        tables = (mi.Bool(table_of(scene, of)) for of in (matte, specular, splits))
+        self.matte_of, self.specular_of, self.splits_of = tables
 
     @cached_property
     def cosines(self) -> np.ndarray:
@@ -70,8 +77,9 @@ class FirstScatterers:
     def behind(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> Scatterer:
         """The first surface that scatters on the main chain that begins at the surface `si`, or `si` itself."""
         chain, left = dr.zeros(mi.UInt32, dr.width(hit)), dr.full(mi.UInt32, MAX_CHAIN, dr.width(hit))
+        branches = dr.zeros(mi.UInt32, dr.width(hit))
         if dr.hint(not self.has_chains, mode="scalar"):
-            return Scatterer(si, self.index(si, hit), chain)
+            return Scatterer(si, self.index(si, hit), chain, branches)
         goes_on = hit & dr.gather(mi.Bool, self.specular_of, number_of(si.shape), hit)
         while goes_on:
             # With 0.5 for a random number, a BSDF of two ways takes the more likely one
@@ -79,8 +87,11 @@ class FirstScatterers:
             is_through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
             way = 2 * mi.UInt32(self.index(si, goes_on)) + dr.select(is_through, mi.UInt32(2), mi.UInt32(1))
             chain = mi.sample_tea_32(chain, way)[0]
+            splits = dr.gather(mi.Bool, self.splits_of, number_of(si.shape), goes_on)
+            splits &= (bs.pdf < CERTAIN) & (branches < MAX_BRANCHES)
+            branches = dr.select(splits, branches + 1, branches)
             ray = si.spawn_ray(si.to_world(bs.wo))
             si = self.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=goes_on)
             hit, left = si.is_valid(), left - 1
             goes_on = hit & (left > 0) & dr.gather(mi.Bool, self.specular_of, number_of(si.shape), hit)
-        return Scatterer(si, self.index(si, hit), chain)
+        return Scatterer(si, self.index(si, hit), chain, branches)

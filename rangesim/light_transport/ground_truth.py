@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -28,13 +29,25 @@ PIXELS_PER_ITERATION = 3
 glassware, with caustics and without. It decides on the size of the first launch of the loop, and nothing else."""
 
 
-def ground_truth(
-    scene: Scene, traced: TracedScene, rig: Rig, has_guides: bool, of_paths: Launches
-) -> tuple[GroundTruth, Guides | None]:
-    """The ground truth of the camera's image, and the guides of the filter of indirect light if it `has_guides`.
+class CentreRays(NamedTuple):
+    """What the rays through the pixels' centres met.
 
-    Both describe the first surface on the ray through each pixel's centre; see `rangesim.signals.GroundTruth`.
-    `of_paths`, the launches of the path loop, learn how fast the machine traces rays in this scene.
+    truth : GroundTruth.
+    guides : Guides of the filter of indirect light; None if there is none.
+    branches : (h, w) uint32, `Scatterer.branches`; None if no pixel has any.
+    """
+
+    truth: GroundTruth
+    guides: Guides | None
+    branches: np.ndarray | None
+
+
+def ground_truth(scene: Scene, traced: TracedScene, rig: Rig, has_guides: bool, of_paths: Launches) -> CentreRays:
+    """The ground truth of the camera's image; the guides of the filter of indirect light if it `has_guides`; and the
+    branches of the main chains.
+
+    All describe what the ray through each pixel's centre meets; see `rangesim.signals.GroundTruth`. `of_paths`, the
+    launches of the path loop, learn how fast the machine traces rays in this scene.
     """
     h, w = rig.camera.height, rig.camera.width
     launches, shapes = Launches(), scene.mitsuba.shapes()
@@ -66,8 +79,10 @@ def ground_truth(
         material_names=MATERIAL_CLASSES,
         instance_objects=tuple(i.object_name for i in scene.instances),
     )
+    branches = image("branches") if scatterers.has_branches else None
+    branches = branches if branches is not None and branches.any() else None
     if not has_guides:
-        return truth, None
+        return CentreRays(truth, None, branches)
     reflectance = image("reflectance")
     first, cosine, number = image("position"), scatterers.cosines[image("scatterer")], image("scatterer")
     if scatterers.has_chains:
@@ -81,7 +96,7 @@ def ground_truth(
         first=first,
         cosine=cosine,
     )
-    return truth, guides
+    return CentreRays(truth, guides, branches)
 
 
 @dr.syntax
@@ -125,6 +140,7 @@ class FirstSurfaces:
     scatterer_position : Vector3f, as `position`.
     shading_normal : Vector3f, unit, world.
     reflectance : Float, see `FirstScatterers.reflectance`.
+    branches : UInt32, see `Scatterer.branches`; None in scenes without clear glass.
     """
 
     index: mi.Int32
@@ -139,6 +155,7 @@ class FirstSurfaces:
     scatterer_position: mi.Vector3f | None
     shading_normal: mi.Vector3f | None
     reflectance: mi.Float | None
+    branches: mi.UInt32 | None
 
 
 def _first_surfaces(
@@ -177,4 +194,5 @@ def _first_surfaces(
         scatterer_position=mi.Vector3f(seen.si.p) - mi.Vector3f(ray.origin) if has_guides else None,
         shading_normal=mi.Vector3f(dr.normalize(seen.si.sh_frame.n)) if has_guides else None,
         reflectance=scatterers.reflectance(seen.si, seen.index >= 0) if has_guides else None,
+        branches=seen.branches if scatterers.has_branches else None,
     )

@@ -15,6 +15,7 @@ import numpy as np
 
 from rangesim.light_transport.caustic_sheets import Sheets
 from rangesim.light_transport.caustics import caustic_sheets, lamp_caustics, sheet_scene
+from rangesim.light_transport.chain_strata import ChainStrata
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -129,7 +130,8 @@ class _CameraPass:
         # The indirect light of beams changes from pixel to pixel, because each has a spot of its own
         can_share = rig.camera.has_neighbours and not isinstance(rig.projector, Beam)
         self.is_filtered = settings.indirect == "filtered" and can_share
-        self.truth, self.guides = ground_truth(scene, self.traced, rig, self.is_filtered, launches)
+        self.truth, self.guides, branches = ground_truth(scene, self.traced, rig, self.is_filtered, launches)
+        self.strata = None if branches is None else ChainStrata(scene.mitsuba, branches)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
         if isinstance(spp, Sampler):
             self.samples = np.full(pixels, spp.first_spp)
@@ -169,7 +171,7 @@ class _CameraPass:
         sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
         light, ambient = (sheet_scene(one, self.here, fewest, settings.seed) for one in (sheets, of_lamps))
-        view = View(self.traced, light, ambient)
+        view = View(self.traced, light, ambient, self.strata)
         of_paths = PathSettings.of(self.scene, settings)
         if guides is not None and self.scene.has_matte_textures:
             few = min(fewest, TEXTURE_SAMPLES)

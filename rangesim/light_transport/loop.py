@@ -38,6 +38,7 @@ from rangesim.light_transport.accumulators import Accumulators, Runs
 from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.beams import BeamDevice, Pencil, Spot
 from rangesim.light_transport.caustics import Draws, Vertex, caustic_light
+from rangesim.light_transport.chain_strata import PERIOD, ChainStrata, stratum_of
 from rangesim.light_transport.delta_surfaces import has_delta, has_throwers, is_thrower
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.lamps import lamps_of
@@ -211,6 +212,8 @@ class PathState:
     scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
     choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex.
         It is spread evenly over the samples of a pixel. None in scenes without delta interactions.
+    turns : UInt32, turns of a period that came to this surface by the main chain, as this path did; 0 if no stratum
+        decides any more. None if no pixel has strata.
     from_wide : Bool, whether the last vertex that is no narrow lobe is on a surface. The light that narrow lobes throw
         on such a surface is part of caustics. None if no caustics come over narrow lobes.
     spot : Spot of the lane's beam; None for a projector, and in scenes with media.
@@ -231,6 +234,7 @@ class PathState:
     events: mi.UInt32
     scattered_inside: mi.Bool
     choice: mi.Float
+    turns: mi.UInt32 | None = None
     from_wide: mi.Bool | None = None
     spot: Spot | None = None
     pencil: Pencil | None = None
@@ -257,12 +261,13 @@ class LaneState:
 
 
 class View(NamedTuple):
-    """Everything that the lanes read: the scene with its devices, and the triangles of light, of the projector and of
-    lamps of the scene (None: there are none)."""
+    """Everything that the lanes read: the scene with its devices, the triangles of light, of the projector and of lamps
+    of the scene, and the strata of the pixels (None: there are none)."""
 
     traced: TracedScene
     sheets: SheetScene | None = None
     of_lamps: SheetScene | None = None
+    strata: ChainStrata | None = None
 
 
 def trace(
@@ -353,6 +358,7 @@ class Lanes:
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.choice_shift = random_stream(settings.seed, self.pixel, Stream.SECOND).next_uint32()
         self.random = Continued(of_part(rng, self.part))
+        self.branches = view.strata.branches_of(self.pixel, self.total) if view.strata is not None else None
         scene = view.traced.scene
         self.throwers = mi.Bool(table_of(scene, list(map(is_thrower, scene.shapes())))) if settings.throws else None
 
@@ -397,6 +403,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes:
             events=dr.zeros(mi.UInt32, n) if in_media else None,
             scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
             choice=dr.zeros(mi.Float, n) if settings.delta else None,
+            turns=dr.zeros(mi.UInt32, n) if view.strata is not None else None,
             from_wide=dr.full(mi.Bool, False, n) if settings.throws and not is_beam else None,
             spot=Spot.none(n) if is_beam and not in_media else None,
             pencil=Pencil.none(n) if is_beam and settings.delta else None,
@@ -432,7 +439,7 @@ def walk(
     max_iterations: mi.UInt32,
 ) -> tuple[LaneState, mi.UInt32]:
     """The state of the lanes after at most `max_iterations` of the loop, and the number of iterations of each lane."""
-    traced, sheets, of_lamps = view
+    traced, sheets, of_lamps, strata = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     n = dr.width(state.sample)
     is_beam = isinstance(projector, BeamDevice)
@@ -456,8 +463,14 @@ def walk(
             starts &= path.chain == 0
         if dr.hint(media is not None, mode="scalar"):
             starts &= path.events == 0
-        number = lanes.number(state.sample)
-        jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, lanes.total)
+        number, total = lanes.number(state.sample), lanes.total
+        if dr.hint(strata is not None, mode="scalar"):
+            has_strata = lanes.branches > 0
+            stratum = stratum_of(lanes.branches, lanes.choice_shift, number)
+            total = dr.select(has_strata, total - number + stratum.number, total)
+            number = dr.select(has_strata, stratum.number, number)
+            path.turns = dr.select(starts, dr.select(has_strata, mi.UInt32(PERIOD), 0), path.turns)
+        jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, total)
         primary = camera.ray_in(lanes.corner, jitter, lens)
         if dr.hint(settings.delta, mode="scalar"):
             path.choice = dr.select(starts, along_golden(lanes.choice_shift, number), path.choice)
@@ -559,6 +572,10 @@ def walk(
         fresh = choice = rng.next_float32()
         if dr.hint(settings.delta, mode="scalar"):
             choice = dr.select(path.is_first, path.choice, fresh)
+        if dr.hint(strata is not None, mode="scalar"):
+            path.turns = dr.select(at_surface & ~is_rough, path.turns, 0)
+            way = strata.choice(bsdf, si, stratum, lanes.branches, path.turns, choice)
+            choice = way.number
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
@@ -668,7 +685,12 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             # Masks do not tell the probability of their decision
             decided = goes_delta & at_surface & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-            path.choice = dr.select(decided, used_up(path.choice, bs.pdf), fresh)
+            left_over = dr.select(decided, used_up(path.choice, bs.pdf), fresh)
+            if dr.hint(strata is not None, mode="scalar"):
+                bs_weight *= way.factor
+                path.turns = way.turns
+                left_over = dr.select(way.is_made, way.left_over, left_over)
+            path.choice = left_over
         path.throughput *= bs_weight
         path.ray_state = path.ray_state.refracted(bs, at_surface)
         if dr.hint(meets_delta, mode="scalar"):
