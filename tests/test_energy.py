@@ -164,8 +164,8 @@ def test_a_white_furnace_hides_lossless_glass() -> None:
         pane=wall(0.5, {**GLASS, "type": "thindielectric"}, 0.1),
     )
     rig = rig_of(CAMERA, PROJECTOR)
-    few = transport(scene, rig, [], spp=7, max_depth=60, rr_depth=60).energy.ambient
-    np.testing.assert_allclose(few, 1.0, atol=2e-3)  # chances alone decide, so each path counts once
+    few = transport(scene, rig, [], spp=6, max_depth=60, rr_depth=60).energy.ambient
+    np.testing.assert_allclose(few, 1.0, atol=2e-3)  # no strata: chances alone decide, and each path counts once
     ambient = transport(scene, rig, [], spp=64, max_depth=60, rr_depth=60).energy.ambient
     assert abs(ambient.mean() - 1) < 2e-4
     np.testing.assert_allclose(ambient, 1.0, atol=0.05)  # at rims, strata cover different parts of a pixel

@@ -465,6 +465,7 @@ def walk(
             starts &= path.events == 0
         number, total = lanes.number(state.sample), lanes.total
         if dr.hint(strata is not None, mode="scalar"):
+            assert lanes.branches is not None
             has_strata = lanes.branches > 0
             stratum = stratum_of(lanes.branches, lanes.choice_shift, number)
             total = dr.select(has_strata, total - number + stratum.number, total)
@@ -573,6 +574,7 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             choice = dr.select(path.is_first, path.choice, fresh)
         if dr.hint(strata is not None, mode="scalar"):
+            assert strata is not None
             path.turns = dr.select(at_surface & ~is_rough, path.turns, 0)
             way = strata.choice(bsdf, si, stratum, lanes.branches, path.turns, choice)
             choice = way.number
