@@ -210,8 +210,9 @@ class PathState:
     pdf : Float, 1/sr, density of the BSDF sample that made the ray.
     events : UInt32, scattering events inside media and crossed boundaries so far; None in scenes without media.
     scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
-    choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex.
-        It is spread evenly over the samples of a pixel. None in scenes without delta interactions.
+    choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex,
+        where no stratum does. It is spread evenly over the samples of a stratum. None in scenes without delta
+        interactions.
     turns : UInt32, turns of a period that came to this surface by the main chain, as this path did; 0 if no stratum
         decides any more. None if no pixel has strata.
     from_wide : Bool, whether the last vertex that is no narrow lobe is on a surface. The light that narrow lobes throw
