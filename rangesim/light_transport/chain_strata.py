@@ -34,7 +34,7 @@ MAX_BRANCHES = 4
 Beyond them, random choices remain. With 2 (6) on `glassware`, 320 x 240, 64 samples, the noise of AMCW on glass is 1.2
 (1.2) times as large."""
 PERIOD = 2 * MAX_BRANCHES
-"""Number of pairs of samples of a half after which the strata come again. Every second pair follows the main chain."""
+"""Number of samples of a half after which the strata come again; one for each branch, and as many of the main chain."""
 MIN_SAMPLES = 8
 """Smallest number of samples of a pixel that has strata. With fewer, most strata would have no sample."""
 NEVER = 0xFFFFFFFF
@@ -64,7 +64,7 @@ class Choice(NamedTuple):
     is_made : Bool, whether the stratum decides. Where it does not, `number` and `left_over` are those that were given.
     factor : Float, by which the weight of the sample is multiplied.
     left_over : Float, uniform number in 0..1 for later choices.
-    turns : UInt32, turns of a period that go on along the main chain, as the path does; 0 if no stratum decides any
+    turns : UInt32, samples of a period that go on along the main chain, as the path does; 0 if no stratum decides any
         more.
     """
 
@@ -107,7 +107,7 @@ class ChainStrata:
         Parameters
         ----------
         branches : UInt32, number of surfaces at which samples of this pixel leave the main chain.
-        turns : UInt32, turns of a period that came here by the main chain, as the path did; 0 if no stratum decides.
+        turns : UInt32, samples of a period that came here by the main chain, as the path did; 0 if no stratum decides.
         number : Float, uniform in 0..1, evenly spread over the samples of the stratum.
         """
         is_made = (turns > 0) & dr.gather(mi.Bool, self.splits_of, number_of(si.shape), turns > 0)
@@ -134,10 +134,10 @@ class ChainStrata:
 def stratum_of(branches: mi.UInt32, shift: mi.UInt32, number: mi.UInt32) -> Stratum:
     """The stratum of a sample.
 
-    The pairs of samples of each half (`SampleAllocation.in_halves`) take turns: the main chain, the first surface, the
-    main chain, the second surface and so on. The other half is half a period ahead, and begins with a surface where
-    this one begins with the main chain; so 16 samples meet all strata. Where there are fewer branches, the main chain
-    has the turns that are left.
+    In each half of the samples (`SampleAllocation.in_halves`), two samples follow the main chain, two leave it at two
+    of the surfaces, two follow it, and two leave it at the other two. So 16 samples meet all strata in each half, and 8
+    samples meet all of them in the two halves together. Where there are fewer branches, the main chain has the samples
+    that are left.
 
     Parameters
     ----------
@@ -145,12 +145,20 @@ def stratum_of(branches: mi.UInt32, shift: mi.UInt32, number: mi.UInt32) -> Stra
     shift : UInt32, random number of the pixel, which decides with which stratum it begins.
     number : UInt32, number of the sample among all samples of the pixel.
     """
-    half, begins = (number >> 1) & 1, (shift ^ (number >> 1)) & 1  # 1 where a pair that leaves comes first
-    turn = (number >> 2) + (shift & (PERIOD - 2)) + half * (PERIOD // 2)
-    period, place = turn // PERIOD, turn % PERIOD
-    branch = place >> 1
-    leaves = ((place ^ begins) & 1 == 1) & (branch < branches)
-    of_main = turn - period * branches - dr.minimum((place + begins) >> 1, branches)
-    of_stratum = dr.select(leaves, period, of_main)
+    half, in_half = (number >> 1) & 1, ((number >> 2) << 1) | (number & 1)
+    pair, second = (in_half & (PERIOD - 1)) >> 1, number & 1  # of the period
+    leaves_first = (shift ^ half) & 1  # the others begin with the main chain
+    later_first = ((shift >> 1) ^ half) & 1  # surfaces 2 and 3 come before 0 and 1
+    branch = (((pair >> 1) ^ later_first) << 1) | (second ^ (shift >> 2) & 1)
+    may_leave = (pair ^ leaves_first) & 1 == 1
+    leaves = may_leave & (branch < branches)
+    # The samples of the main chain are those of the half before this one that did not leave
+    of_early = dr.minimum(branches, 2)
+    of_first = dr.select(later_first == 1, branches - of_early, of_early)
+    left = (in_half // PERIOD) * branches + dr.select(pair + leaves_first > 1, of_first, 0)
+    left += dr.select(pair + leaves_first > 3, branches - of_first, 0)
+    left += dr.select(may_leave & (second == 1) & (branch ^ 1 < branches), mi.UInt32(1), 0)
+    of_stratum = dr.select(leaves, in_half // PERIOD, in_half - left)
     first = dr.select(leaves, (branch + 1) * STRATUM_STEP, 0)
-    return Stratum(number=first + (of_stratum << 2) + (number & 3), leaves_at=dr.select(leaves, branch, NEVER))
+    in_pairs = ((of_stratum >> 1) << 2) | (half << 1) | (of_stratum & 1)
+    return Stratum(number=first + in_pairs, leaves_at=dr.select(leaves, branch, NEVER))

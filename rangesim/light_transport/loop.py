@@ -213,8 +213,8 @@ class PathState:
     choice : Float in 0..1, which decides between reflection and refraction, and between lobes, up to the first vertex,
         where no stratum does. It is spread evenly over the samples of a stratum. None in scenes without delta
         interactions.
-    turns : UInt32, turns of a period that came to this surface by the main chain, as this path did; 0 if no stratum
-        decides any more. None if no pixel has strata.
+    turns : UInt32, samples of a period that came to this surface by the main chain, as this path did; 0 if no
+        stratum decides any more. None if no pixel has strata.
     from_wide : Bool, whether the last vertex that is no narrow lobe is on a surface. The light that narrow lobes throw
         on such a surface is part of caustics. None if no caustics come over narrow lobes.
     spot : Spot of the lane's beam; None for a projector, and in scenes with media.
