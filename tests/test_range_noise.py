@@ -227,7 +227,7 @@ def test_the_detectors_sigma_is_that_between_captures_of_one_render(
         *to_validate(
             ("tabletop", StructuredLight(), 0, 96, 0.03),
             ("tabletop", StructuredLight(), 1, 96, 0.02),
-            ("glassware", StructuredLight(), 1, 64, 0.05),
+            ("glassware", StructuredLight(), 1, 64, 0.03),
             ("tabletop", AmcwToF(), 1, 96, 0.006),
         ),
     ],
