@@ -104,6 +104,20 @@ def test_light_that_is_reflected_between_two_faces_is_left_to_chance(samples: in
     assert abs(error.mean()) < 4 * error.std() / error.size**0.5
 
 
+def test_no_sample_of_a_stratum_lies_at_the_centre_of_its_pixel() -> None:
+    """A strip of light behind a pane covers the middle fifth of a column of pixels, and brings a fifth of its light."""
+    pixel_m = 2 * 2.0 * np.tan(np.radians(20)) / 32
+    turned = transform().translate([pixel_m / 2, 0, 2]).rotate([1, 0, 0], 180).scale([0.1 * pixel_m, 5, 1])
+    strip = {"type": "rectangle", "to_world": turned, "emitter": {"type": "area", "radiance": 1.0}}
+    scene = scene_of(pane=wall(0.5, {**GLASS, "type": "thindielectric"}), strip=strip)
+    rig = rig_of(CAMERA, PROJECTOR)
+    seen = [transport(scene, rig, [], spp=16, seed=seed).energy.ambient[:, 16] for seed in range(12)]
+    tangent = np.abs(CAMERA.normalise(CAMERA.pixel_centres())[:, 16, 1])
+    reflectance = fresnel_dielectric(tangent / np.hypot(1, tangent))
+    expected = 0.2 * np.mean((1 - reflectance) / (1 + reflectance))
+    assert np.mean(seen) == pytest.approx(expected, rel=0.05)
+
+
 def test_the_mean_of_a_ball_that_few_samples_see_has_no_bias() -> None:
     """With fewer than eight samples there are no strata, and chance decides."""
     ball = {"type": "sphere", "center": [0.02, 0.01, 0.6], "radius": 0.15, "bsdf": GLASS}

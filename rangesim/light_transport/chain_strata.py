@@ -36,7 +36,7 @@ Beyond them, random choices remain. With 2 (6) on `glassware`, 320 x 240, 64 sam
 PERIOD = 2 * MAX_BRANCHES
 """Number of samples of a half after which the strata come again; one for each branch, and as many of the main chain."""
 MIN_SAMPLES = 8
-"""Smallest number of samples of a pixel that has strata. With fewer, most strata would have no sample."""
+"""Smallest number of samples of a pixel that has strata. With fewer, some strata would have no sample."""
 NEVER = 0xFFFFFFFF
 """Value of `Stratum.leaves_at` of paths that follow the main chain."""
 STRATUM_STEP = 0x10000

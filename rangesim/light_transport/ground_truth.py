@@ -30,7 +30,7 @@ glassware, with caustics and without. It decides on the size of the first launch
 
 
 class CentreRays(NamedTuple):
-    """What the rays through the pixels' centres met.
+    """Result of the rays through the pixels' centres.
 
     truth : GroundTruth.
     guides : Guides of the filter of indirect light; None if there is none.

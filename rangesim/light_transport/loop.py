@@ -469,7 +469,7 @@ def walk(
             assert lanes.branches is not None
             has_strata = lanes.branches > 0
             stratum = stratum_of(lanes.branches, lanes.choice_shift, number)
-            total = dr.select(has_strata, total - number + stratum.number, total)
+            total = dr.select(has_strata, 0, total)  # no sample of a stratum is the lone one at the pixel's centre
             number = dr.select(has_strata, stratum.number, number)
             path.turns = dr.select(starts, dr.select(has_strata, mi.UInt32(PERIOD), 0), path.turns)
         jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, total)
